@@ -24,6 +24,7 @@ from megastep.agents.launch import signals
 from megastep.agents.reports import runs as reported
 from megastep.agents.runs import folders
 from megastep.imports import import_path
+from megastep.settings import plain
 from megastep.types import optional
 
 if TYPE_CHECKING:
@@ -111,46 +112,32 @@ class Run:
         return record(self, **settings)
 
     def export(self, format: str, file: "str | os.PathLike | None" = None) -> Path:
-        """Writes the agent for another runtime, "onnx", "torch" or "safetensors", by default
-        into the run's folder. Returns the path.
+        """Writes the agent as "onnx", "torch" or "safetensors", by default into the run's folder.
+        Returns the path.
         """
         from megastep.agents.cli import export
 
         return export.COMMAND.call(_plain(dict(run=self, format=format, file=file), "settings"))
 
-    def web(
-        self,
-        file: "str | os.PathLike | None" = None,
-        against: str | None = None,
-        homes: list[int] | None = None,
-        seed: int = 1,
-    ) -> Path:
-        """Writes a page that plays the agent in a browser. Returns the path.
-
-        Args:
-            file: default: `page.html` in the run's folder.
-            against: another run, which plays the other agents.
-            homes: numbers of homes of the test split. Default: the first four.
-            seed: of the first episodes.
+    def web(self, file: "str | os.PathLike | None" = None, **settings: object) -> Path:
+        """Writes a page that plays the agent in a browser, by default `page.html` in the run's
+        folder. Returns the path. `settings` are words of `megastep web`: against, homes, seed.
         """
         from megastep.agents.cli import web
 
-        chosen = dict(run=self, against=against, homes=homes, seed=seed, file=file)
-        return web.COMMAND.call(_plain(chosen, "settings"))
+        return web.COMMAND.call(_plain({"run": self, "file": file, **settings}, "settings"))
 
 
 def make(env: object, privileged: bool = False, **settings_of_env: object) -> "Env":
     """Returns an environment: `megastep.make("explorer", n_envs=64, geometry="homes")`. On a CPU
-    this sets the number of threads as training does: the engine gets all, PyTorch one.
+    this sets the number of threads as training does: the engine gets all, PyTorch one. Raises
+    UserError if a setting is unknown or out of range, or the environment cannot be made.
 
     Args:
         env: name, class, import path, or dict with `name` and settings.
         privileged: worlds have what only an asymmetric critic sees, if the environment has any.
         settings_of_env: the environment's settings, and as on the command line `geometry`, `split`
             ("training" here), `seed` and `device`.
-
-    Raises:
-        UserError: a setting is unknown or out of range; the environment cannot be made.
     """
     from megastep.agents import factory  # with PyTorch
 
@@ -172,9 +159,7 @@ def make(env: object, privileged: bool = False, **settings_of_env: object) -> "E
 
 def train(**settings: object) -> Run | None:
     """Trains: `megastep.train(env="explorer", seconds=60)`. Returns the run; None for a dry run.
-
-    Args:
-        settings: words of `megastep train`, which `megastep train --help` explains.
+    `settings` are words of `megastep train`, which `megastep train --help` explains.
 
     Raises:
         UserError: training cannot start or continue; what was learnt is saved.
@@ -206,7 +191,7 @@ def evaluate(
     if _is_policy(run):
         played = playing.first_episodes(_played(env), run, **cast(dict, settings))
         return statistics.summaries(played, optional(env, "roles"))
-    cfg = _settings("evaluate", _given(run=run, env=env) | settings)
+    cfg = _settings("evaluate", {"run": run} | ({} if env is None else {"env": env}) | settings)
     with _interrupts():
         return json.loads(evaluate_run.run(cfg).with_suffix(".json").read_text())["rows"]
 
@@ -232,7 +217,8 @@ def record(
     if _is_policy(run):
         options = cast(dict, settings)
         return recording.film(_played(env), run, options.pop("file"), **options)
-    cfg = _settings("record", _given(run=run, env=env) | settings)
+    given = {key: value for key, value in (("run", run), ("env", env)) if value is not None}
+    cfg = _settings("record", given | settings)
     with _interrupts():
         return recording.Film(filming.run(cfg))
 
@@ -247,8 +233,8 @@ def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
         file: NAME.safetensors.
 
     Raises:
-        UserError: the policy is of another class or acts in other spaces, `make` did not return the
-            environment, a weight is too large, or the file cannot be written.
+        UserError: the policy or the environment is another, a weight is too large, or the file
+            cannot be written.
     """
     from megastep.agents.export import agent  # with PyTorch
     from megastep.agents.networks.policy import Policy
@@ -257,7 +243,7 @@ def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
     if type(policy) is not Policy:
         raise UserError(
             f"save takes a megastep.agents.networks.policy.Policy, got {type(policy).__name__}; a "
-            "network of your own becomes one as Policy(env, core='my_module:Class')"
+            "network of your own becomes one as Policy(env, core=Class)"
         )
     if (made := next((v for k, v in _made.items() if k is env), None)) is None:
         raise UserError(
@@ -308,13 +294,9 @@ def _plain(value, key) -> Any:
     if isinstance(value, Sequence):
         return [_plain(part, key) for part in value]
     if isinstance(value, numbers.Real):
-        return int(value) if isinstance(value, numbers.Integral) else float(value)
+        return plain(value)
     problem = "is not a setting; use numbers, texts, lists, dicts, or a class"
     raise ConfigErrors([(key, f"{type(value).__name__} {problem}")])
-
-
-def _given(**arguments) -> dict:
-    return {key: value for key, value in arguments.items() if value is not None}
 
 
 def _settings(name: str, arguments: Mapping[str, object]) -> Any:
@@ -326,9 +308,6 @@ def _settings(name: str, arguments: Mapping[str, object]) -> Any:
     cfg = compose.settings_from(chosen, plain)
     chosen.ready(cfg)
     return cfg
-
-
-# ---- Policies, and signals ----
 
 
 def _is_policy(run) -> "TypeGuard[PolicyLike]":

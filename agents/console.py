@@ -49,7 +49,7 @@ class TolerantStream:
 
 def open_streams() -> None:
     """Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
-    that no file takes their number. A thread that ends for a full disk costs a line.
+    that no file takes their number.
     """
     threading.excepthook = warn_of_thread
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
@@ -94,11 +94,9 @@ def warned(prefix: str = "") -> Iterator[None]:
 
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
     """Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it."""
-    if isinstance(failure.exc_value, OSError):
-        name = failure.thread.name if failure.thread else "a thread"
-        warn(f"{name} stopped: {failure.exc_value}")
-    else:
-        threading.__excepthook__(failure)
+    if not isinstance(failure.exc_value, OSError):
+        return threading.__excepthook__(failure)
+    warn(f"{failure.thread.name if failure.thread else 'a thread'} stopped: {failure.exc_value}")
 
 
 def is_unicode() -> bool:
@@ -114,30 +112,19 @@ def table(
     """Returns a table as text: in Markdown, or in characters that stdout can show.
 
     Args:
-        width: in characters. The last columns are left out until it fits, and a line below names
-            them. The first two stay.
+        width: in characters, for which cells are broken.
     """
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    def shown(n, width=10_000) -> str:
-        style = box.HEAVY_HEAD if is_unicode() else box.ASCII
-        grid, text = Table(*head[:n], box=box.MARKDOWN if is_markdown else style), StringIO()
-        for row in rows:
-            grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row[:n]))
-        plain: dict = dict(markup=False, emoji=False, color_system=None)
-        Console(file=text, width=width, force_terminal=False, **plain).print(grid)
-        return text.getvalue().strip()
-
-    n = len(head)
-    text = shown(n)
-    while width and n > 2 and max(map(len, text.splitlines())) > width:
-        n -= 1
-        text = shown(n, width if n == 2 else 10_000)  # whose cells are broken if they must be
-    if n == len(head):
-        return text
-    return f"{text}\nToo wide for this terminal, but in the file: {', '.join(head[n:])}"
+    style = box.HEAVY_HEAD if is_unicode() else box.ASCII
+    grid, text = Table(*head, box=box.MARKDOWN if is_markdown else style), StringIO()
+    for row in rows:
+        grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
+    plain: dict = dict(markup=False, emoji=False, color_system=None)
+    Console(file=text, width=width or 10_000, force_terminal=False, **plain).print(grid)
+    return text.getvalue().strip()
 
 
 def terminal_width() -> int | None:

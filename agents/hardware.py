@@ -7,11 +7,8 @@ from megastep.agents.errors import user_errors
 
 
 def make_device(name: str, index: int | None = None) -> torch.device:
-    """Returns the device `auto`, `cpu`, `cuda` or `cuda:1`, and makes a GPU the current one. Raises
-    UserError if there is none.
-
-    Args:
-        index: of the GPU that `auto` and `cuda` mean.
+    """Returns the device `auto`, `cpu`, `cuda` (the GPU `index`) or `cuda:1`, and makes a GPU the
+    current one. Raises UserError if there is none.
     """
     if index is not None and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
         name = f"cuda:{index}"

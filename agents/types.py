@@ -1,7 +1,5 @@
-"""Protocols of the learner's parts, and the defaults of what is optional.
-
-Nothing has to inherit from them: any object with these attributes will do. The rules behind them
-are in :mod:`megastep.agents.algorithms.learner`. T steps, B lanes.
+"""Protocols of the learner's parts, and the defaults of what is optional. Any object with these
+attributes will do; :mod:`megastep.agents.algorithms.learner` has the rules. T steps, B lanes.
 """
 
 from __future__ import annotations
@@ -15,22 +13,6 @@ import torch
 
 from megastep.coefficients import Coefficients
 from megastep.types import Env, PolicyLike
-
-__all__ = [
-    "Actor",
-    "CollectorLike",
-    "CollectorOptions",
-    "Config",
-    "Learner",
-    "LearnerOptions",
-    "Logger",
-    "Moments",
-    "RolloutLike",
-    "Row",
-    "RunResult",
-    "StateDict",
-    "with_defaults",
-]
 
 #: What an object saves: tensors and plain values by name, in nested dicts and lists.
 StateDict = dict[str, Any]
@@ -99,9 +81,8 @@ class CollectorOptions(Protocol):
     """What a collector may have besides `CollectorLike`, with the defaults.
 
     Attributes:
-        allocate_layouts: has the environment's layouts in its rollouts from then on,
-            `rollout.layouts`, (T, B) int32, so that reports have statistics of episodes by the
-            source of their floor plan. None: they have not.
+        allocate_layouts: has rollouts hold `layouts`, (T, B) int32, from then on, for statistics by
+            the source of floor plans. None: they hold none.
     """
 
     allocate_layouts: Callable[[], None] | None = None
@@ -112,9 +93,7 @@ class CollectorOptions(Protocol):
 
     @staticmethod
     def state_dict() -> StateDict:
-        """Returns all that it carries from rollout to rollout, to resume bit for bit. Empty: a
-        resumed run begins new episodes.
-        """
+        """Returns all that it carries from rollout to rollout. Empty: resumed runs begin anew."""
         return {}
 
     @staticmethod
@@ -124,10 +103,7 @@ class CollectorOptions(Protocol):
 
 @runtime_checkable
 class Learner(Protocol):
-    """Improves a policy: ``rollout = collect()``, ``losses = learner.update(rollout)``, repeat.
-
-    `LearnerOptions` has what is optional.
-    """
+    """Improves a policy: ``rollout = collect()``, ``losses = learner.update(rollout)``, repeat."""
 
     lr: float  # initial learning rate
 
@@ -199,9 +175,8 @@ class Logger(Protocol):
     """What `logger=module:Class` names.
 
     Its constructor takes those that it wants of `folder`, the run folder, a Path; `step`, the
-    environment steps at which a resumed run starts, 0 in others; `run_name`, the folder's name; and
-    `config`, the run's settings as nested dicts. Its other arguments are settings. A logger that
-    raises is dropped with a warning, and the run goes on.
+    environment steps at which the run starts; `run_name`, the folder's name; and `config`, the
+    run's settings. Its other arguments are settings. One that raises is dropped with a warning.
     """
 
     def write(self, step: int, values: Mapping[str, float | str]) -> None:
@@ -214,13 +189,8 @@ class Logger(Protocol):
 class RunResult(NamedTuple):
     """What a logger that has a method `finish(step, result)` gets at the end of a run that was not
     interrupted. It is made anew for that, with the number of samples as `step`.
-
-    Attributes:
-        numbers: the final ones by name, such as `score`, the last mean return.
-        film: path of the video, if one was made.
-        table: rows of the evaluation, if there was one: texts by column.
     """
 
-    numbers: dict[str, float]
-    film: Path | None = None
-    table: Sequence[Mapping[str, str]] = ()
+    numbers: dict[str, float]  # the final ones by name, such as `score`, the last mean return
+    film: Path | None = None  # path of the video
+    table: Sequence[Mapping[str, str]] = ()  # rows of the evaluation: texts by column

@@ -6,8 +6,7 @@
     def __init__(self, n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128): ...
 
 The command line makes a dataclass of the same arguments with `settings_of`. True is not an integer,
-"3" is not a number, and numbers are finite, but for those of users' classes. In settings, a list
-may stand for a tuple and 1e6 for an integer, as files and command lines have them.
+"3" is not a number, and numbers are finite, but for those of users' classes.
 """
 
 import dataclasses
@@ -30,17 +29,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
 if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
 
-__all__ = [
-    "MAX_ENVS",
-    "AtMost",
-    "checked",
-    "closest",
-    "frozen",
-    "located",
-    "parameters_of",
-    "sentence",
-    "settings_of",
-]
+__all__ = ["MAX_ENVS", "AtMost", "checked", "closest", "frozen", "parameters_of", "settings_of"]
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable)
@@ -120,7 +109,6 @@ WANTED = {
 }
 BOUNDS = {"ge": "at least {:,}", "gt": "more than {:,}", "le": "at most {:,}", "lt": "below {:,}"}
 OUTSIDE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number")
-LENGTHS = {"too_short": "at least {min_length}", "too_long": "at most {max_length}"}
 RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and below {:,}"}
 
 
@@ -135,19 +123,16 @@ def settings_of(
     is_strict: bool = False,
     **more,
 ) -> type:
-    """Returns a frozen dataclass of the arguments of a class or function: types, bounds, defaults.
-    An argument without an annotation has the type of its default.
+    """Returns a frozen dataclass of the arguments of a class or function (`parameters_of`): types,
+    bounds, defaults. An argument without an annotation has the type of its default. Raises
+    ValueError if an annotation cannot be read, or an argument is called as a field of `more`.
 
     Args:
-        constructor: the class or function, with the arguments of `parameters_of`.
         reserved: arguments to leave out.
         missing: defaults for arguments that may have none.
         is_finite: infinity and NaN are refused.
-        is_strict: no value is converted: a list is no tuple.
+        is_strict: no value is converted. Else a list may stand for a tuple, 1e6 for an integer.
         more: fields to add: a type, or (type, default).
-
-    Raises:
-        ValueError: an annotation cannot be read, or an argument is called as a field of `more`.
     """
     fields = {name: f if isinstance(f, tuple) else (f,) for name, f in more.items()}
     try:
@@ -163,11 +148,11 @@ def settings_of(
                     default = (missing or {}).get(name, default)
                 fields[name] = _field(hints.get(name), default)
         body: dict = {"__annotations__": {key: field[0] for key, field in fields.items()}}
-        for key, (_, *default) in fields.items():
-            if default and type(default[0]).__hash__ is None:  # it could change, such as a list
-                body[key] = dataclasses.field(default_factory=lambda value=default[0]: value)
-            elif default:
-                body[key] = default[0]
+        for key, (_, *defaults) in fields.items():
+            for value in defaults:
+                if type(value).__hash__ is None:  # it could change, such as a list
+                    value = dataclasses.field(default_factory=lambda value=value: value)
+                body[key] = value
         return _frozen(type(constructor.__name__, (), body), is_finite, is_strict)
     except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
         raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
@@ -195,8 +180,9 @@ def _signatures(constructor) -> Iterator[tuple[Callable, dict[str, inspect.Param
             if one is constructor:
                 raise
             return
-        kinds = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
-        named = {name: a for name, a in arguments.items() if a.kind not in kinds}
+        named = {
+            k: a for k, a in arguments.items() if a.kind not in (a.VAR_POSITIONAL, a.VAR_KEYWORD)
+        }
         yield (one.__init__ if inspect.isclass(one) else one), named
         if not any(a.kind is a.VAR_KEYWORD for a in arguments.values()):
             return
@@ -214,24 +200,21 @@ def _field(hint, default) -> tuple:
 
 
 def _has_members(protocol, value) -> object:
-    """Returns a value that has all members of a protocol, also those that a wrapper has by
-    `__getattr__`, which `isinstance` does not see from Python 3.12; ValueError otherwise.
+    """Returns a value that has all members of a protocol, also by `__getattr__`, which `isinstance`
+    does not see from Python 3.12; ValueError otherwise.
     """
     members = {**protocol.__annotations__, **vars(protocol)}
     absent = [name for name in members if not name.startswith("_") and not hasattr(value, name)]
     if absent:
-        raise ValueError(
-            f"{type(value).__name__} is not an {protocol.__name__}: it has no {', '.join(absent)}"
-        )
+        name = type(value).__name__
+        raise ValueError(f"{name} is not an {protocol.__name__}: it has no {', '.join(absent)}")
     return value
 
 
 def checked(function: F) -> F:
     """Decorator: checks a function's arguments against its annotations. The function gets its
-    arguments as they are, not copies, unlike with `pydantic.validate_call`.
-
-    Raises:
-        ValueError: naming every argument that is wrong, and what is allowed.
+    arguments as they are, not copies, unlike with `pydantic.validate_call`. Raises ValueError
+    naming every argument that is wrong, and what is allowed.
     """
     signature = inspect.signature(function)
     settings = functools.cache(lambda: settings_of(function, ("self",), is_strict=True))
@@ -240,11 +223,7 @@ def checked(function: F) -> F:
     def wrapped(*args, **kwargs) -> object:
         arguments = signature.bind(*args, **kwargs).arguments
         fields = settings().__pydantic_fields__
-        values = {name: value for name, value in arguments.items() if name in fields}
-        for name, value in values.items():  # NumPy's numbers are Python's
-            if isinstance(value, numbers.Real) and not isinstance(value, (bool, int, float)):
-                is_whole = isinstance(value, numbers.Integral)
-                values[name] = int(value) if is_whole else float(value)
+        values = {name: plain(value) for name, value in arguments.items() if name in fields}
         try:
             settings()(**values)
         except ValidationError as error:
@@ -256,6 +235,13 @@ def checked(function: F) -> F:
         return function(*args, **kwargs)
 
     return typing.cast(F, wrapped)
+
+
+def plain(value: Any) -> Any:
+    """Returns a number of NumPy, or any other, as Python's; other values as they are."""
+    if isinstance(value, numbers.Real) and not isinstance(value, (bool, int, float)):
+        return int(value) if isinstance(value, numbers.Integral) else float(value)
+    return value
 
 
 # ---- What is wrong, in words ----
@@ -273,9 +259,6 @@ def sentence(error: Mapping, field: FieldInfo | None, value: object) -> str:
         return error["msg"]
     if kind == "value_error":
         return str(error["ctx"]["error"])
-    if kind in LENGTHS:
-        bound, n = LENGTHS[kind].format(**error["ctx"]), error["ctx"]["actual_length"]
-        return f"a list of {n} is out of range: allowed is {bound}"
     if kind in OUTSIDE or isinstance(value, float) and not math.isfinite(value):
         return f"{value} is out of range: allowed is {allowed(field)}"
     if kind == "literal_error" and field:
@@ -323,14 +306,12 @@ def closest(word: object, words: Iterable[object]) -> str:
 
 def located(errors: Iterable[tuple[str, str]]) -> ValidationError:
     """Returns a pydantic error with a sentence for each dotted key."""
-    return ValidationError.from_exception_data(
-        "settings",
-        [
-            InitErrorDetails(
-                type=PydanticCustomError("located", "{text}", {"text": text}),
-                loc=tuple(key.split(".")),
-                input=None,
-            )
-            for key, text in errors
-        ],
-    )
+    lines = [
+        InitErrorDetails(
+            type=PydanticCustomError("located", "{text}", {"text": text}),
+            loc=tuple(key.split(".")),
+            input=None,
+        )
+        for key, text in errors
+    ]
+    return ValidationError.from_exception_data("settings", lines)

@@ -1,10 +1,4 @@
-"""Blocks of configuration files: what differs by the device and by the learner.
-
-    learner:
-      gamma: 0.99
-    cpu:                 # laid over this file on a CPU
-      learner:
-        gamma: 0.98
+"""Blocks of configuration files, such as `cpu:`: what differs by the device and by the learner.
 
 A block is merged as Hydra reads its file, so a later file wins over the blocks of an earlier one. A
 learner of a user has the blocks of the built-in learner that it derives from, if of any.
@@ -23,7 +17,7 @@ from omegaconf import Container, DictConfig, OmegaConf
 from megastep.agents import package
 from megastep.agents.factory import check, components
 from megastep.agents.launch import gpu
-from megastep.imports import import_object
+from megastep.imports import import_object, import_path
 
 if TYPE_CHECKING:
     from hydra.plugins.config_source import ConfigResult
@@ -67,29 +61,30 @@ plugins.Plugins.instance().register(Folders)
 def blocks_of(device: object, learner: object) -> dict[str, bool]:
     """Returns the names of blocks, and whether they apply on a device and with a learner."""
     is_cpu = device == "cpu" or (device == "auto" and not gpu.is_available())
-    name = built_in(str(learner))
-    learners = {one: one == name for one in components.members("learner")}
+    own = built_in(str(learner))
+    learners = {name: name == own for name in components.members("learner")}
     return {"cpu": is_cpu, "gpu": not is_cpu, **learners}
 
 
 def built_in(learner: str) -> str | None:
     """Returns the name of the built-in learner whose blocks a learner has; None if it has none."""
     names = {path: name for name, path in components.members("learner").items()}
+    if learner in names.values():
+        return learner
     paths = [learner]
     if ":" in learner and learner not in names:
         with suppress(ValueError):  # which is an error when the settings are checked
-            bases = getattr(import_object(learner), "__mro__", ())
-            paths = [f"{base.__module__}:{base.__qualname__}" for base in bases]
-    known = [names[path] for path in paths if path in names]
-    return learner if learner in names.values() else next(iter(known), None)
+            paths = [*map(import_path, getattr(import_object(learner), "__mro__", ()))]
+    return next((names[path] for path in paths if path in names), None)
 
 
 def merged(tree: check.Tree, blocks: Mapping[str, bool]) -> check.Tree:
     """Returns what a file holds with its blocks merged into it."""
     own = [name for name in blocks if isinstance(tree.get(name, False), (dict, NoneType))]
     content = {key: value for key, value in tree.items() if key not in own}
-    for layer in [merged(tree[name] or {}, blocks) for name in own if blocks[name]]:
-        content = _over(content, layer)
+    for name in own:
+        if blocks[name]:
+            content = _over(content, merged(tree[name] or {}, blocks))
     return content
 
 

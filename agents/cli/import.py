@@ -1,8 +1,6 @@
 """megastep import source=SOURCE path=FILE: floor plans of others, as geometries."""
 
-import contextlib
 import importlib.util
-import sys
 import tempfile
 import time
 import zipfile
@@ -33,7 +31,7 @@ These write home.npz here, and a picture, home-sheet.png; geometry=files geometr
 it. In a drawing walls have the id, class or label `wall`, doors `door`; walls=NAME names another.
 
   file=plan.npz        where it goes, overwritten if it exists
-  licence=accept       confirms the licence, instead of a question
+  licence=accept       confirms the licence
   per=file             one geometry per file, not per floor, as in the original megastep
   entrances=open       leaves the doors to the outside open, as there; by default they are closed"""
 
@@ -76,9 +74,8 @@ def run(
     entrances: Literal["sealed", "open"] | None = None,
 ) -> None:
     """Imports floor plans."""
-    given = {key: value for key, value in locals().items() if value is not None}
-    for key in given:
-        if key not in ("source", "path", *KEYS[source]):
+    for key, value in locals().items():
+        if value is not None and key not in ("source", "path", *KEYS[source]):
             raise UserError(f"source={source} has no {key}; it has {', '.join(KEYS[source])}")
     if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
         raise UserError(
@@ -87,27 +84,24 @@ def run(
     if source in DATABASES:
         _import_database(source, Path(path), licence, per or "floor", entrances != "open")
         return
-    own, target = Path(path), Path(file or f"{Path(path).stem}.npz")
-    if not own.is_file():
+    marks = {key: name for key, name in (("walls", walls), ("doors", doors)) if name}
+    _import_own(source, Path(path), file, scale, metres_per_pixel, marks)
+
+
+def _import_own(source, path, file, scale, metres_per_pixel, marks) -> None:
+    """Imports one drawing or map."""
+    if not path.is_file():
         raise UserError(f"path={path} does not exist, or is not a file")
-    if target.suffix != ".npz":
-        raise UserError(f"file={target} must end with .npz")
+    file = Path(file or f"{path.stem}.npz")
+    if file.suffix != ".npz":
+        raise UserError(f"file={file} must end with .npz")
     if source == "svg" and scale is None:
         raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
-    _import_own(own, target, scale, metres_per_pixel, {k: given[k] for k in MARKS if k in given})
-
-
-#: What names the walls and doors of a drawing.
-MARKS = "walls", "doors"
-
-
-def _import_own(path, file, scale, metres_per_pixel, marks) -> None:
-    """Imports one drawing, or map if there is no scale."""
     from megastep.geometries import files
     from megastep.geometries.plans import imports, sheets
 
     with user_errors(f"{path} is not a floor plan: "):
-        if scale is None:
+        if source == "map":
             own = imports.own_map(path, metres_per_pixel)
         else:
             own = imports.own_svg(path, scale, **marks)
@@ -125,26 +119,14 @@ def _import_own(path, file, scale, metres_per_pixel, marks) -> None:
     )
 
 
-def _confirm(source, licence) -> None:
-    """Shows where a database is to be had, and has its licence confirmed."""
-    title, place, terms, _ = DATABASES[source]
-    console.say(f"{title}\n  from {place}\n  licence: {terms}")
-    if licence == "accept":
-        return
-    if not sys.stdin or not sys.stdin.isatty():
-        raise UserError("the licence is not confirmed; licence=accept does so")
-    answer = ""
-    with contextlib.suppress(EOFError):
-        answer = input("Was it downloaded from there, and do you accept the licence? [y/N] ")
-    if answer.strip().lower() not in ("y", "yes"):
-        raise UserError("the licence is not confirmed, so nothing is imported")
-
-
 def _import_database(source, path, licence, per, is_sealed) -> None:
     start = time.monotonic()
     if not path.exists():
         raise UserError(f"path={path} does not exist")
-    _confirm(source, licence)
+    title, place, terms, n_known = DATABASES[source]
+    console.say(f"{title}\n  from {place}\n  licence: {terms}")
+    if licence is None:
+        raise UserError("the licence is not confirmed; licence=accept does so")
     from megastep.geometries import databases
     from megastep.geometries.plans import imports, sheets
 
@@ -154,7 +136,7 @@ def _import_database(source, path, licence, per, is_sealed) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     with console.counting("files"), user_errors():
-        n_files = _n_files(path, suffix) or DATABASES[source][-1]
+        n_files = _n_files(path, suffix) or n_known
         plans = imports.run(options, path, lambda n: console.count(n, max(n, n_files)))
     geometries = [g for plan in plans for g in plan.geometries]
     numbers = [i for i, plan in enumerate(plans) for _ in plan.geometries]
@@ -188,7 +170,6 @@ def _report(source, path, plans, n) -> str:
     title, _, licence, _ = DATABASES[source]
     notes = [(plan.name, note) for plan in plans for note in plan.notes]
     refused = [(plan.name, plan.refusal) for plan in plans if plan.refusal]
-    kinds = Counter(refusal for _, refusal in refused)
     n_rooms, n_reachable = (sum(note[i] for _, note in notes) for i in (0, 1))
     warnings = [f"- {name}: {text}" for name, note in notes for text in note.warnings]
     lines = [
@@ -198,7 +179,7 @@ def _report(source, path, plans, n) -> str:
         f"- {n_reachable:,} of {n_rooms:,} rooms can be reached; agents spawn in these alone",
         f"- {sum(note.n_sealed for _, note in notes):,} doors to the outside are closed",
         "## Refused",
-        *(f"- {n:,} times: {text}" for text, n in kinds.most_common()),
+        *(f"- {n:,} times: {text}" for text, n in Counter(t for _, t in refused).most_common()),
         *[f"- {name}: {text}" for name, text in refused][:MAX_LINES],
         "## Warnings",
         *warnings[:MAX_LINES],

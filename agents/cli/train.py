@@ -47,18 +47,8 @@ The most common words:
                                several loggers; csv, none, or a class of your own"""
 #: What may differ when a run is repeated.
 REPEATABLE = (
-    "rerun",
-    "member",
-    "folder",
-    "device",
-    "trust",
-    "logging.profile",
-    "checkpoints.seconds",
-    "checkpoints.keep",
-    "checkpoints.replay_every",
-    "dry_run",
-    "logger",
-    "finish",
+    *("rerun", "member", "folder", "device", "trust", "dry_run", "logger", "finish"),
+    *("logging.profile", "checkpoints.seconds", "checkpoints.keep", "checkpoints.replay_every"),
 )
 #: The keys that take a run, each with what is said of a key that cannot go with it.
 CURES = {

@@ -1,38 +1,16 @@
 """Makes the objects of a run from plain settings: device, homes, environment, policy, learner.
 
-    from megastep.agents import factory
-
-    device = factory.make_device("auto")
-
-The functions need PyTorch, so they are imported at their first use: settings are checked without
-it.
+`factory.homes` and so on are the functions of `make`, which is imported at their first use: it
+needs PyTorch, without which settings are checked.
 """
 
 import importlib
 from typing import Any
 
-_FUNCTIONS = (
-    "check_memory",
-    "config_of",
-    "construct",
-    "errors",
-    "homes",
-    "in_env",
-    "layout_sources",
-    "make_bot",
-    "make_device",
-    "make_learner",
-    "make_opponents",
-    "make_policy",
-    "make_sample",
-    "share_threads",
-    "sources_of",
-    "spread",
-    "typed_or",
-)
+_MODULES = "check", "components", "conflicts", "env_failures", "make", "settings", "trainer"
 
 
 def __getattr__(name) -> Any:
-    if name in _FUNCTIONS:
-        return getattr(importlib.import_module(f"{__name__}.make"), name)
-    raise AttributeError(f"module {__name__} has no attribute {name!r}")
+    if name in _MODULES or name.startswith("_"):
+        raise AttributeError(f"module {__name__} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.make"), name)

@@ -14,8 +14,6 @@ from megastep.agents.factory import components
 from megastep.settings import sentence
 
 Tree = dict[str, Any]
-#: Types of what files and words hold, beside lists and dicts.
-SCALARS = (str, int, float, bool, type(None))
 T = TypeVar("T")
 
 
@@ -50,9 +48,8 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
 
 
 def as_tree(chosen: Any, prefix: str = "") -> Tree:
-    """The inverse of `check`: strings, numbers, true, false, None, lists and nested dicts, without
-    defaults that only the constructor can give, such as functions. Raises ConfigErrors for other
-    values that no file can hold.
+    """The inverse of `check`, without defaults that only the constructor can give, such as
+    functions. Raises ConfigErrors for other values that no file can hold.
     """
     tree = {}
     for name, field in type(chosen).__pydantic_fields__.items():
@@ -74,7 +71,8 @@ def _plain(value, prefix="") -> Any:
         return {_plain(key): _plain(part, f"{prefix}{key}.") for key, part in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(part) for part in value]
-    return value if type(value) in SCALARS else to_jsonable_python(value)
+    is_scalar = type(value) in (str, int, float, bool, type(None))
+    return value if is_scalar else to_jsonable_python(value)
 
 
 def fields_of(kind: type, tree: object, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -106,10 +104,6 @@ def leaves(tree: Tree, prefix: str = "") -> list[tuple[str, Any]]:
     return [leaf for key, below in tree.items() for leaf in leaves(below, f"{prefix}.{key}")]
 
 
-#: Ratio of equal letters from which two keys are near.
-NEAR = 0.75
-
-
 def closest_key(key: str, keys: Iterable[str]) -> str:
     """Returns a hint that names the key nearest to one that there is not, or lists those of its
     group if none is near.
@@ -117,17 +111,14 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
     # by the whole key or its last part: `lr` and `learner.lrr` find `learner.lr`
     names = [*keys]
     named = {name.rpartition(".")[2]: name for name in names} | {name: name for name in names}
-    near = difflib.get_close_matches(key, named, n=1, cutoff=NEAR)
-    near = near or difflib.get_close_matches(key.rpartition(".")[2], named, n=1, cutoff=NEAR)
-    if near:
-        return f"did you mean {named[near[0]]}?"
+    for part in key, key.rpartition(".")[2]:
+        if near := difflib.get_close_matches(part, named, n=1, cutoff=0.75):
+            return f"did you mean {named[near[0]]}?"
     group = f"{key.rpartition('.')[0]}."
-    inside = {
-        name.removeprefix(group).partition(".")[0] for name in names if name.startswith(group)
-    }
-    if not inside:
-        group, inside = "", {name.partition(".")[0] for name in names if "/" not in name}
-    return f"{f'{group[:-1]} has' if group else 'there are'} {', '.join(sorted(inside))}"
+    inside = {name[len(group) :].partition(".")[0] for name in names if name.startswith(group)}
+    if inside:
+        return f"{group[:-1]} has {', '.join(sorted(inside))}"
+    return f"there are {', '.join(sorted({n.partition('.')[0] for n in names if '/' not in n}))}"
 
 
 #: Keys of earlier versions, and the new ones.
@@ -145,10 +136,11 @@ MOVED = {
 
 
 def _unknown(path: list[str], keys: list[str]) -> str:
-    group, leaf = path[0], path[-1]
+    group = path[0]
     if group in MOVED:
         return f"is now called {MOVED[group]}"
-    for member, name in components.members(group).items() if group in components.CHOSEN else ():
-        if path[1:] == [leaf] and leaf in components.kind_of(group, name).__pydantic_fields__:
-            return f"no such key here; {group}={member} has it"
+    if group in components.CHOSEN and len(path) == 2:
+        for member, name in components.members(group).items():
+            if path[1] in components.kind_of(group, name).__pydantic_fields__:
+                return f"no such key here; {group}={member} has it"
     return f"no such key; {closest_key('.'.join(path), keys)}"

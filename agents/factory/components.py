@@ -27,9 +27,7 @@ adapter = functools.cache(TypeAdapter)
 
 
 def _wrappers(value: object) -> tuple[object, ...]:
-    """Returns the wrappers of an environment, names and dicts of `name` and settings. Raises
-    ValueError for others.
-    """
+    """Returns the wrappers of an environment: names, and dicts of `name` and settings."""
     items = [value] if isinstance(value, (str, dict)) else value
     if not isinstance(items, (list, tuple)):
         raise ValueError(f"expected a list of wrappers, got {value!r}")
@@ -48,12 +46,11 @@ def wrapper_settings(item: "str | dict") -> Any:
     """Returns the settings of a wrapper, with the import path of its class as `name`. Raises
     ValueError if they are not those of the class.
     """
-    tree = {"name": item} if isinstance(item, str) else dict(item)
+    tree = {"name": item} if isinstance(item, str) else item
     label = tree["name"]
-    tree["name"] = members("wrapper").get(label, label)
-    kind = kind_of("wrapper", tree["name"])
+    kind = kind_of("wrapper", path := members("wrapper").get(label, label))
     try:
-        return adapter(kind).validate_python(tree)
+        return adapter(kind).validate_python(tree | {"name": path})
     except ValidationError as error:
         line, fields = error.errors()[0], kind.__pydantic_fields__
         key = str(line["loc"][0])
@@ -65,27 +62,16 @@ def wrapper_settings(item: "str | dict") -> Any:
 
 
 class Group(NamedTuple):
-    """How the arguments of a group's members become settings.
+    """How the arguments of a group's members become settings."""
 
-    Attributes:
-        reserved: arguments that megastep passes.
-        needed: {argument: meaning} of what a member must take.
-        missing: defaults of arguments that may have none.
-        more: settings beside the arguments.
-        methods: that a class must have.
-        where: the folder of its modules, or the module of its functions, relative to megastep's.
-        first: the first argument of its members, which others there do not have.
-        shared: modules there that hold no member.
-    """
-
-    reserved: tuple[str, ...] = ()
-    needed: dict[str, str] = {}
-    missing: dict[str, Any] = {}
-    more: dict[str, Any] = {"name": str}
-    methods: tuple[str, ...] = ()
-    where: str | None = None
-    first: str | None = None
-    shared: tuple[str, ...] = ()
+    reserved: tuple[str, ...] = ()  # arguments that megastep passes
+    needed: dict[str, str] = {}  # {argument: meaning} of what a member must take
+    missing: dict[str, Any] = {}  # defaults of arguments that may have none
+    more: dict[str, Any] = {"name": str}  # settings beside the arguments
+    methods: tuple[str, ...] = ()  # that a class must have
+    where: str | None = None  # the folder of its modules, or the module of its functions
+    first: str | None = None  # argument of its members, which others there do not have
+    shared: tuple[str, ...] = ()  # modules there that hold no member
 
 
 GROUPS = {
@@ -109,10 +95,7 @@ GROUPS = {
         reserved=("policy", "seed", "graph"),
         needed={"policy": "the policy to improve"},
         # what lr falls to 0 over; auto: samples if given, else seconds if given
-        more={
-            "name": str,
-            "anneal": (Literal["auto", "never", "samples", "seconds"], "auto"),
-        },
+        more={"name": str, "anneal": (Literal["auto", "never", "samples", "seconds"], "auto")},
         where="agents/algorithms",
         first="policy",
     ),
@@ -132,11 +115,8 @@ GROUPS = {
         more={"bot_class": (str | None, None)},  # None: the environment's own
     ),
 }
-#: Groups whose member has `name`, the import path of a class or function, and decides which
-#: settings there are.
+#: Groups whose member has `name`, an import path, and decides which settings there are.
 CHOSEN = ("env", "geometry", "learner", "curriculum", "logger")
-
-
 #: The only member of a group.
 SINGLE = {"agent": POLICY, "opponents": OPPONENTS}
 

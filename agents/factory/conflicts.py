@@ -43,18 +43,16 @@ def of_training(cfg: "Train") -> Iterator[tuple[str, str]]:
             yield key, "is a schedule over the budget; give samples= or seconds="
     for name in ("samples", "seconds"):
         if cfg.resume is None and getattr(cfg, f"more_{name}") is not None:
-            yield (
-                f"more_{name}",
-                f"extends a resumed run; give resume=RUN, or {name}= for a new run",
-            )
+            text = f"extends a resumed run; give resume=RUN, or {name}= for a new run"
+            yield f"more_{name}", text
     yield from _population_conflicts(cfg)
     if cfg.member is not None and cfg.init is None:
         yield "member", "is of a population whose weights start a run; give init=RUN"
     if cfg.evaluation.stop and cfg.evaluation.every is None:
         text = "needs evaluations in training to reach it: give evaluation.every=60s, or 1M"
         yield "evaluation.stop", text
-    budgets = cfg.samples, cfg.seconds, cfg.more_samples, cfg.more_seconds
-    if cfg.checkpoints.snapshots and not any(budgets):
+    has_budget = any((cfg.samples, cfg.seconds, cfg.more_samples, cfg.more_seconds))
+    if cfg.checkpoints.snapshots and not has_budget:
         yield "checkpoints.snapshots", "are spread over the budget; give samples= or seconds="
 
 
@@ -90,17 +88,13 @@ def _bounds(field) -> Scheduled | None:
 
 def schedules_of(cfg: "Train") -> list[str]:
     """Returns the keys of settings that have a schedule."""
-    items = [components.wrapper_settings(one) for one in cfg.env.wrappers if isinstance(one, dict)]
     fields = [*_fields(cfg)]
-    for item in items:
-        of_item = item.__pydantic_fields__.items()
-        fields += [("env.wrappers", field, getattr(item, name)) for name, field in of_item]
+    for wrapper in cfg.env.wrappers:
+        if isinstance(wrapper, dict):
+            item = components.wrapper_settings(wrapper)
+            own = item.__pydantic_fields__.items()
+            fields += [("env.wrappers", field, getattr(item, name)) for name, field in own]
     return [k for k, field, value in fields if _bounds(field) and not isinstance(value, float)]
-
-
-def variable(cfg: "Train") -> dict[str, Scheduled]:
-    """Returns the bounds, by key, of the settings that members of a population may vary."""
-    return {key: bounds for key, field, _ in _fields(cfg) if (bounds := _bounds(field))}
 
 
 def _population_conflicts(cfg: "Train") -> Iterator[tuple[str, str]]:
@@ -131,7 +125,8 @@ def _population_conflicts(cfg: "Train") -> Iterator[tuple[str, str]]:
 
 
 def _problem_of_variation(cfg, key, one) -> str | None:
-    bounds = variable(cfg)
+    """Returns why a setting cannot vary between members of a population, None if it can."""
+    bounds = {name: limits for name, field, _ in _fields(cfg) if (limits := _bounds(field))}
     if key not in bounds:
         return f"cannot vary; {closest(key, bounds)}"
     if key in schedules_of(cfg):

@@ -23,11 +23,8 @@ def caught(
     env: Env, folder: Path, saved: Callable[[], str] = lambda: "", rank: int = 0
 ) -> Iterator[None]:
     """Turns an error of an environment into an EnvFailed, and writes its traceback into a file in a
-    folder. Errors of megastep's own code are raised as they are.
-
-    Args:
-        saved: returns what else to say, such as the command that resumes.
-        rank: number of this process, which another's file than rank 0's has in its name.
+    folder. Errors of megastep's own code are raised as they are. `saved` returns what else to say,
+    such as the command that resumes.
     """
     try:
         yield

@@ -67,22 +67,18 @@ errors = functools.partial(user_errors, kinds=KINDS)
 def construct(settings: "Component", constructor: Callable | None = None, **arguments: Any) -> Any:
     """Calls a class or function, by default the one at `settings.name`, with those of the settings
     and arguments that it takes.
-
-    A setting that a class passes on to its base class as one of its `**kwargs` is left out if it
-    has the default there: a class may fix one.
     """
     with errors():
         is_env = constructor is None and hasattr(settings, "wrappers")
         constructor = constructor or import_object(settings.name)
         taken, own = parameters_of(constructor), inspect.signature(constructor).parameters
-        values = {
-            key: value
-            for key, value in vars(settings).items()
-            if key in own
-            or (key in taken and value is not taken[key].default and value != taken[key].default)
-        }
-        # an environment may change a list that it is given, and the next one is to get it whole
-        values = {k: copy.deepcopy(v) if type(v) in (dict, list) else v for k, v in values.items()}
+        values = {}
+        for key, value in vars(settings).items():
+            default = taken[key].default if key in taken else value
+            # of what goes on to a base class, defaults are left out: a class may fix one
+            if key in own or (value is not default and value != default):
+                # an environment may change a list that it is given, and the next gets it whole
+                values[key] = copy.deepcopy(value) if type(value) in (dict, list) else value
         values |= {key: value for key, value in arguments.items() if key in taken}
         inside, outside = _wrappers_of(settings, taken) if is_env else ([], [])
         if is_env and "wrappers" in taken:
@@ -106,21 +102,15 @@ def _wrappers_of(settings, taken) -> tuple[list[str], list]:
     for item in settings.wrappers:
         name = item["name"] if isinstance(item, dict) else item
         kind = import_object(name) if ":" in name else Wrapper
-        is_ours = inspect.isclass(kind) and issubclass(kind, Wrapper)
-        if is_ours:
+        if inspect.isclass(kind) and issubclass(kind, Wrapper):
             outside.append(components.wrapper_settings(item))
-        elif "wrappers" not in taken:
-            raise ValueError(
-                f"env.wrappers: {name} is not a megastep.wrappers.Wrapper, and "
-                f"{env_name(settings)} takes no wrappers of another package"
-            )
-        elif isinstance(item, dict):
-            raise ValueError(
-                f"env.wrappers: {name} is not a megastep.wrappers.Wrapper, so it takes no settings "
-                "here; derive a class that has them"
-            )
-        else:
+        elif "wrappers" in taken and not isinstance(item, dict):
             inside.append(name)
+        else:
+            text = "takes no settings here; derive a class that has them"
+            if "wrappers" not in taken:
+                text = f"cannot be used, as {env_name(settings)} takes none of another package"
+            raise ValueError(f"env.wrappers: {name} is no megastep.wrappers.Wrapper and {text}")
     return inside, outside
 
 
@@ -163,12 +153,7 @@ def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
 
 
 def check_memory(
-    env: Env,
-    sample: types.Env,
-    learner: object,
-    geometries: list,
-    n_members: int = 1,
-    **arguments,
+    env: Env, sample: types.Env, learner: object, geometries: list, n_members: int = 1, **arguments
 ) -> None:
     """Raises UserError with the number that fits, if environments, a replay buffer or members of a
     population need more than the memory. The `sample` counts what environments share; only if that
@@ -201,12 +186,7 @@ def check_memory(
                 raise
 
 
-def make_policy(
-    agent: Agent,
-    env: types.Env,
-    seed: int = 1,
-    critic: str | None = None,
-) -> Policy:
+def make_policy(agent: Agent, env: types.Env, seed: int = 1, critic: str | None = None) -> Policy:
     """Returns a policy on the environment's device; without a `critic` it can only act."""
     if torch.device(env.device).type == "cpu":
         share_threads(agent.width)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import components, conflicts
 from megastep.agents.factory.components import env_name, label
 from megastep.agents.population.variation import Variation
@@ -27,15 +28,15 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def _device(name: str) -> str:
-    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
-        raise ValueError(f"{name!r} is not a device; use auto, cpu, cuda or cuda:<number>")
-    return name
-
-
 def _listed(names: object) -> object:
     names = [names] if isinstance(names, str) else names
     return tuple(names) if isinstance(names, list) else names
+
+
+def _players(names: object) -> object:
+    """Returns the names of `baseline=`: `true` is random actions; `false` and `none` are nobody."""
+    is_nobody = names in (None, False, "none")
+    return _listed([] if is_nobody else "random" if names is True else names)
 
 
 def _callback(name: str) -> str:
@@ -45,12 +46,6 @@ def _callback(name: str) -> str:
     except TypeError as error:
         raise ValueError(f"{name} must take no arguments ({error})") from None
     return name
-
-
-def _ranks(n: int | str) -> int | str:
-    if n != "all" and (isinstance(n, str) or not 1 <= n <= 10_000):
-        raise ValueError(f"{n!r} is not a number of ranks; use 1 or more, or all")
-    return n
 
 
 #: Units of seconds, and factors of counts.
@@ -75,12 +70,10 @@ def _every(given: int | float | str) -> int | str:
     seconds, samples = (cast("float | str", quantity(given, kind)) for kind in UNITS)
     if isinstance(given, str) and re.fullmatch(r"[\d.]+ *m", given):
         raise ValueError(f"{given!r} may be minutes or millions: write min or M")
-    is_samples = isinstance(given, str) and given.endswith("M")
-    if isinstance(given, str) and not isinstance(seconds, str) and not is_samples:
-        if not 0 < seconds < 1e9:
-            raise ValueError(f"{given!r} is not a time")
+    is_time = isinstance(given, str) and not given.endswith("M") and not isinstance(seconds, str)
+    if is_time and 0 < cast(float, seconds) < 1e9:
         return f"{seconds}s"
-    if isinstance(samples, str) or samples < 1 or samples != int(samples):
+    if is_time or isinstance(samples, str) or samples < 1 or samples != int(samples):
         raise ValueError(f"{given!r} is neither samples, such as 1M, nor a time, such as 60s")
     return int(samples)
 
@@ -123,6 +116,11 @@ def _group(group: str) -> object:
     return Annotated[Any, BeforeValidator(settings)]
 
 
+def _default(group: str) -> Any:
+    """Returns a field with the defaults of a group that has a single member."""
+    return dataclasses.field(default_factory=functools.partial(components.settings_for, group))
+
+
 def changed(settings: T, **changes: object) -> T:
     """Returns a copy of settings with other values. Nothing is checked again, since a stranger's
     default need not be what its annotation says. Raises TypeError for a key that there is not.
@@ -148,10 +146,8 @@ def run_name(cfg: "Train") -> str:
 
 def _chosen_loggers(tree) -> dict:
     """Returns nested dicts of loggers by label. Raises for keys of loggers that were not chosen."""
-    if not isinstance(tree, dict):
-        raise ValueError(f"is a group of keys, got {tree!r}")
     errors, known = [], components.members("logger")
-    for key, value in tree.items():
+    for key, value in tree.items() if isinstance(tree, dict) else ():
         if not (dataclasses.is_dataclass(value) or isinstance(value, dict) and "name" in value):
             text = f"no such logger, whose keys are logger.wandb.mode=; {closest(key, known)}"
             if key in known:
@@ -187,7 +183,7 @@ class Common:
     """Settings of every script."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)]
-    device: Annotated[str, AfterValidator(_device)]
+    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     trust: bool = False  # import what checkpoints that others made name
 
     def conflicts(self) -> Iterator[tuple[str, str]]:
@@ -197,7 +193,7 @@ class Common:
     @model_validator(mode="after")
     def _agree(self) -> "Self":
         if errors := [*self.conflicts()]:
-            raise located(errors)
+            raise ConfigErrors(errors)
         return self
 
 
@@ -247,14 +243,10 @@ class Population:
 class Train(Common):
     env: Env
     geometry: Geometry
-    agent: Agent = dataclasses.field(
-        default_factory=functools.partial(components.settings_for, "agent")
-    )
+    agent: Agent = _default("agent")
     learner: Learner
     curriculum: Curriculum = cast("Curriculum", components.NoCurriculum(name="none"))
-    opponents: Opponents = dataclasses.field(
-        default_factory=functools.partial(components.settings_for, "opponents")
-    )
+    opponents: Opponents = _default("opponents")
     population: Population = Population()
     logger: Loggers = dataclasses.field(default_factory=dict)
     finish: Finish
@@ -269,7 +261,7 @@ class Train(Common):
     callbacks: Annotated[
         tuple[Annotated[str, AfterValidator(_callback)], ...], BeforeValidator(_listed)
     ] = ()
-    ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
+    ranks: Annotated[int, Field(ge=1, le=10_000)] | Literal["all"] = 1
     dry_run: bool = False
     folder: str | None
     resume: str | None
@@ -289,9 +281,7 @@ class Trained:
     env: Env
     geometry: Geometry
     agent: Agent
-    opponents: Opponents = dataclasses.field(
-        default_factory=functools.partial(components.settings_for, "opponents")
-    )
+    opponents: Opponents = _default("opponents")
 
 
 @frozen
@@ -309,14 +299,6 @@ def _given(run: T | None) -> T:
     if run is None:
         raise ValueError("is missing; run=latest takes the newest run, run=FOLDER another one")
     return run
-
-
-def _players(names: object) -> object:
-    """Returns the names of `baseline=`: `true` is random actions; `false` and `none` are nobody."""
-    if isinstance(names, bool) or names in (None, "none"):
-        return ("random",) * (names is True)
-    names = [names] if isinstance(names, str) else names
-    return tuple(names) if isinstance(names, list) else names
 
 
 @frozen

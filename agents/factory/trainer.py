@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import math
 import random
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -50,16 +49,13 @@ def make_trainer(
     homes: list[dict] | None = None,
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
-    says so.
-
-    Each rank has one. All begin with the same weights; whatever else a seed decides differs.
+    says so. Each rank has one. All begin with the same weights; what else a seed decides differs.
 
     Args:
         token: a name that all ranks of this start have, and no other start.
         ranks: those that train the policy; None: all that there are.
         callbacks: of rank 0, before those of `cfg`.
-        make_evaluator: returns what measures the policy in training, for `cfg`, the environment of
-            the training, the device and the ranks, such as `evaluation.in_training.Evaluator`.
+        make_evaluator: (cfg, env, device, ranks) -> what measures the policy in training.
         n_members: trainers of a population that memory is to hold from this one on.
         homes: the floor plans to train in, if they are made already.
     """
@@ -139,8 +135,8 @@ def make_trainer(
 
 
 def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint | None:
-    """Returns the checkpoint that a run continues or starts from, whose weights the policy then
-    has.
+    """Gives the policy the weights of the checkpoint that a run continues or starts from, if any.
+    Returns it.
     """
     if not (start := cfg.resume or cfg.init):
         return None
@@ -161,11 +157,8 @@ def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint | Non
 def make_loggers(cfg: settings.Train, folder: Path, step: int) -> loggers.Loggers:
     """Returns the loggers of a run that starts, resumes or ends at `step`."""
     facts = dict(folder=folder, step=step, run_name=folder.name, config=check.as_tree(cfg))
-    makers = {
-        label: functools.partial(factory.construct, one, **facts)
-        for label, one in cfg.logger.items()
-    }
-    return loggers.Loggers(folder, step, makers)
+    make = functools.partial(functools.partial, factory.construct, **facts)
+    return loggers.Loggers(folder, step, {label: make(one) for label, one in cfg.logger.items()})
 
 
 @contextlib.contextmanager
@@ -184,11 +177,8 @@ def state_errors(path: Path) -> Iterator[None]:
 def differing(before: "Row", now: "Row") -> list[str]:
     """Returns a clause for each of the things that a run's bits depend on that has changed."""
     before, now = {"ranks": 1, **before}, {"ranks": 1, **now}
-    return [
-        f"{name} was {value} and is {now.get(name)}"
-        for name, value in before.items()
-        if value != now.get(name)
-    ]
+    changed = {name: value for name, value in before.items() if value != now.get(name)}
+    return [f"{name} was {value} and is {now.get(name)}" for name, value in changed.items()]
 
 
 def budget_of(
@@ -198,13 +188,8 @@ def budget_of(
     recorded = ()
     if cfg.rerun:
         source = folders.folder_of(folders.find(cfg.rerun))
-        recorded = annealing.read(source)
-        if not recorded or any(map(math.isnan, recorded)):
-            raise UserError(
-                f"{source} cannot be repeated: {annealing.FILE} does not hold the learning rate of "
-                "each update, as an earlier version began the run; start a new one with its "
-                f"settings, which are in {source / 'config.yaml'}"
-            )
+        if not (recorded := annealing.read(source)):
+            raise UserError(f"{source} cannot be repeated: it has no {annealing.FILE}")
     elif loaded is not None:
         recorded = annealing.read(folder)
         # a clock of another budget would have chosen others

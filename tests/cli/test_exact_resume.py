@@ -326,5 +326,5 @@ def test_rerun(here, capsys):
     assert "from line 2 on" in capsys.readouterr().err
     (here / "run/annealing.f64").unlink()
     assert train.main(["rerun=run", "folder=fourth"]) == 2
-    assert "does not hold the learning rate" in capsys.readouterr().err
+    assert "it has no annealing.f64" in capsys.readouterr().err
     assert not (here / "fourth").exists()

@@ -223,7 +223,7 @@ def test_rewards_are_scaled_clipped_and_shaped():
         ("[{name:frame_stack,m:3}]", "frame_stack has no setting 'm'; there are n, sensors"),
         ("[{name:drop_sensor,sensor:rgb}]", "there is no sensor 'rgb'; leave sensor out"),
         ("[{n:3}]", "a wrapper is a name or {name: ..., setting: ...}"),
-        ("[os:getcwd]", "os:getcwd is not a megastep.wrappers.Wrapper, and minimal takes"),
+        ("[os:getcwd]", "os:getcwd is no megastep.wrappers.Wrapper and cannot be used, as minimal"),
         ("[{name:clip_reward,min:1}]", "0 must be between min=1 and max=1"),
         ("[{name:scale_reward,factor:{from:1}}]", "scale_reward: factor: expected a number"),
     ],
