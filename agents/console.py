@@ -48,9 +48,7 @@ class TolerantStream:
 
 
 def open_streams() -> None:
-    """Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
-    that no file takes their number.
-    """
+    """Makes stdout and stderr tolerant of errors and encodings, and opens closed ones."""
     threading.excepthook = warn_of_thread
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
@@ -140,9 +138,7 @@ def restore() -> None:
 
 
 class Progress:
-    """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds, the
-    first after `wait` seconds.
-    """
+    """A context: a bar with a line of text; where there is no terminal, a line every 10 seconds."""
 
     def __init__(self, wait: float = 0):
         from rich import progress  # only for those who wait

@@ -22,9 +22,7 @@ EXIT_CODES = {
 
 
 class UserError(Exception):
-    """Something the user can put right, in one sentence. Ends the program with the exit code
-    `code`.
-    """
+    """Something the user can put right, in one sentence. Ends the program with `code`."""
 
     code = 2
 

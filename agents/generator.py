@@ -19,10 +19,8 @@ def rank_seed(seed: int, rank: int) -> int:
 
 
 class SeededGenerator:
-    """A `torch.Generator` that is created from a seed on the device where it is first used.
-
-    A state saved on one type of device means nothing on another: there, the sequence starts again
-    from the seed.
+    """A `torch.Generator` that is created from a seed on the device where it is first used. A state
+    that was saved on another type of device is left out: there, the sequence starts again.
     """
 
     def __init__(self, seed: int):

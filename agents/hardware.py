@@ -20,9 +20,7 @@ def make_device(name: str, index: int | None = None) -> torch.device:
 
 
 def share_threads(width: int) -> None:
-    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer, as threads
-    lose more by waiting for each other in smaller ones.
-    """
+    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer."""
     n_threads = devices.threads()
     devices.set_threads(n_threads)
     torch.set_num_threads(max(1, min(n_threads, width // 128)))

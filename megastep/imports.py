@@ -37,9 +37,7 @@ def import_object(name: str) -> Callable:
 
 
 def import_path(thing: object) -> str:
-    """Returns `module:Class` of a class or function; a name as it is. Raises ValueError if it has
-    none, as it was defined in a function.
-    """
+    """Returns `module:Class` of a class or function; a name as it is. ValueError for local ones."""
     if isinstance(thing, str):
         return thing
     name = getattr(thing, "__qualname__", "<")
@@ -75,9 +73,7 @@ def resolve(name: str, table: Mapping[str, str], base: type) -> type:
 
 
 def known_name(name: str | type, names: Sequence[str]) -> str:
-    """Returns `name`, which is one of `names` or a class, or its import path. Raises ValueError if
-    it is neither.
-    """
+    """Returns a name in `names`, or the import path of a class. Raises ValueError for others."""
     name = import_path(name)
     if name not in names:
         if ":" not in name:

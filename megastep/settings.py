@@ -52,9 +52,7 @@ def _whole(value) -> object:
 
 
 def _strict(hint) -> Any:
-    """Returns an annotation that takes no other type for a number, a word or a boolean, while a
-    list may stand for a tuple and 1e6 for an integer.
-    """
+    """Returns an annotation that converts only a list into a tuple and 1e6 into an integer."""
     origin: Any = typing.get_origin(hint)
     options = typing.get_args(hint)
     if hint is int:
@@ -159,9 +157,7 @@ def settings_of(
 
 
 def parameters_of(constructor: Callable) -> dict[str, inspect.Parameter]:
-    """Returns the named arguments of a class or function. If a class takes `**kwargs`, those of its
-    base class are among them.
-    """
+    """Returns the named arguments of a class or function, and of the bases that get **kwargs."""
     found = {}
     for _, arguments in _signatures(constructor):
         found |= {name: one for name, one in arguments.items() if name not in found}
@@ -169,9 +165,7 @@ def parameters_of(constructor: Callable) -> dict[str, inspect.Parameter]:
 
 
 def _signatures(constructor) -> Iterator[tuple[Callable, dict[str, inspect.Parameter]]]:
-    """Yields (function, {name: parameter}) of a class or function, and of the base classes that its
-    `**kwargs` go to.
-    """
+    """Yields (function, {name: parameter}) of a callable, and of bases that get its **kwargs."""
     bases = constructor.__mro__[1:-1] if inspect.isclass(constructor) else ()
     for one in (constructor, *(base for base in bases if "__init__" in vars(base))):
         try:
@@ -200,9 +194,7 @@ def _field(hint, default) -> tuple:
 
 
 def _has_members(protocol, value) -> object:
-    """Returns a value that has all members of a protocol, also by `__getattr__`, which `isinstance`
-    does not see from Python 3.12; ValueError otherwise.
-    """
+    """Returns a value that has the members of a protocol, also by `__getattr__`, or ValueError."""
     members = {**protocol.__annotations__, **vars(protocol)}
     absent = [name for name in members if not name.startswith("_") and not hasattr(value, name)]
     if absent:

@@ -1,13 +1,12 @@
 """Blocks of configuration files, such as `cpu:`: what differs by the device and by the learner.
 
-A block is merged as Hydra reads its file, so a later file wins over the blocks of an earlier one. A
-learner of a user has the blocks of the built-in learner that it derives from, if of any.
+A block is merged as Hydra reads its file, so a later file wins over the blocks of an earlier one.
 """
 
 from collections.abc import Mapping
 from contextlib import suppress
 from types import NoneType
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core import plugins
@@ -82,17 +81,8 @@ def merged(tree: check.Tree, blocks: Mapping[str, bool]) -> check.Tree:
     """Returns what a file holds with its blocks merged into it."""
     own = [name for name in blocks if isinstance(tree.get(name, False), (dict, NoneType))]
     content = {key: value for key, value in tree.items() if key not in own}
-    for name in own:
-        if blocks[name]:
-            content = _over(content, merged(tree[name] or {}, blocks))
-    return content
-
-
-def _over(below, above) -> Any:
-    """Returns one value over another: nested dicts key by key."""
-    if not (isinstance(below, dict) and isinstance(above, dict)):
-        return above
-    return below | {key: _over(below.get(key), value) for key, value in above.items()}
+    layers = [merged(tree[name] or {}, blocks) for name in own if blocks[name]]
+    return plain(cast(Container, OmegaConf.merge(content, *layers)))
 
 
 def plain(config: Container, resolve: bool = False) -> check.Tree:

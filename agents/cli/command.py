@@ -138,9 +138,7 @@ class Command:
 
 
 def without_dashes(word: str) -> str:
-    """Returns `--learner.lr=0.1`, as W&B's agents write it, as `learner.lr=0.1`; options as they
-    are.
-    """
+    """Returns `--learner.lr=0.1`, as W&B has it, as `learner.lr=0.1`; options as they are."""
     is_option = word.startswith(("--cfg=", "--config-dir=", "--config-name="))
     return word.removeprefix("--") if "=" in word and not is_option else word
 
@@ -151,9 +149,7 @@ def load(name: str) -> Command:
 
 
 def with_member(tree: check.Tree, key: str) -> check.Tree:
-    """Returns the tree with the folder of a population's member at a key, in place of the
-    population's and of `member`. Raises ConfigErrors if there is no such member.
-    """
+    """Returns the tree with a population's member at a key, in place of it and of `member`."""
     run, member = tree.get(key), tree.get("member")
     if member is None or not isinstance(run, str):
         return tree

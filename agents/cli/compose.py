@@ -1,8 +1,4 @@
-"""The words of a command line, or keyword arguments -> Hydra -> checked settings.
-
-`hydra.compose` composes the groups from files, with their `blocks`. Keys are set in what comes out,
-so that every error has its own word.
-"""
+"""The words of a command line, or keyword arguments -> Hydra -> checked settings."""
 
 import copy
 import functools
@@ -222,9 +218,7 @@ class Composer:
     def _composed(
         self, *groups: str, device: str | None = None, learner: str | None = None
     ) -> DictConfig:
-        """Returns the configuration of files, with the blocks of the device and learner that they
-        choose.
-        """
+        """Returns the configuration of files, with the blocks of the device and learner in them."""
         typed = dict(word.lstrip("+").split("=", 1) for word in groups if "=" in word)
         applied = blocks.blocks_of(device or "auto", learner or typed.get("learner", GUESS))
         while True:

@@ -1,6 +1,4 @@
-"""Starts commands: as scripts, as the command `megastep`, or with `python -m megastep`. Signals and
-closed streams are handled before anything else is imported.
-"""
+"""Starts commands. Signals and closed streams are handled before anything else is imported."""
 
 import importlib
 import sys

@@ -28,9 +28,7 @@ The most common words:
 
 
 def prepare(tree: Tree, typed: list[str]) -> Tree:
-    """Returns the tree with the member of a population, and without what files set for training
-    alone.
-    """
+    """Returns the tree with a population's member, and without settings of training alone."""
     tree = with_member(tree, "run")
     kinds = settings.Train, settings.Played
     train, played = ({field.name for field in dataclasses.fields(kind)} for kind in kinds)

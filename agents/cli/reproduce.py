@@ -41,9 +41,7 @@ class Interval(NamedTuple):
         return f"{self.value:.4g} ({self.lower:.4g} to {self.upper:.4g})"
 
     def agrees(self, stated: str) -> bool:
-        """Returns true if the interval, rounded as the stated one is, has a number in common with
-        it.
-        """
+        """Returns true if it has a number in common with the stated one, rounded alike."""
         match = STATED.fullmatch(stated)
         assert match is not None, stated
         percent, *bounds = match.groups()
@@ -125,9 +123,7 @@ def found_in(rows: list[dict], metric: str) -> Interval:
 
 
 def compare(name: str, row: dict, folder: Path, found: list[Interval]) -> int:
-    """Prints how numbers compare with those stated, and writes reproduction.json. Returns the exit
-    code.
-    """
+    """Prints how numbers compare, and writes reproduction.json. Returns the exit code."""
     samples = json_lines.read(folder / "metrics.jsonl")[-1]["samples"]
     agree, values = True, {}
     for (_, page, metric, text), number in zip(results(row), found, strict=True):

@@ -52,13 +52,13 @@ COLUMNS = ("state", "score", "evaluated", "lower", "upper", "seconds")
 #: What a search is to do, if nothing else is typed: look for high returns, and go past failed jobs.
 SEARCH = {"hydra.sweeper.direction": "maximize", "hydra.sweeper.max_failure_rate": "1.0"}
 
-OmegaConf.register_new_resolver(
-    "file_name",  # of characters that shells and Hydra leave alone, and at most 255 bytes
-    lambda text: (
-        re.sub(r"[^\w.=-]+", "-", text).encode()[:200].decode(errors="ignore") or "default"
-    ),
-    replace=True,
-)
+
+def _file_name(text: str) -> str:
+    """Returns a name of characters that shells and Hydra leave alone, and at most 255 bytes."""
+    return re.sub(r"[^\w.=-]+", "-", text).encode()[:200].decode(errors="ignore") or "default"
+
+
+OmegaConf.register_new_resolver("file_name", _file_name, replace=True)
 
 
 # ---- Before the first job ----
@@ -110,14 +110,6 @@ def metric_of(words: list[str]) -> tuple[str, list[str]]:
     return metric, [word for word in words if not word.startswith("metric=")]
 
 
-def check_metric(metric: str, jobs: list) -> None:
-    """Raises ConfigErrors if the metric is of evaluations, and a training has none."""
-    for cfg in jobs if metric.startswith("eval/") else ():
-        if isinstance(cfg, settings.Train) and not (cfg.finish.evaluate or cfg.evaluation.every):
-            cure = "needs evaluations: finish.evaluate=true, or evaluation.every=1M"
-            raise ConfigErrors([("metric", cure)])
-
-
 def sweep(composer: Composer, words: list[str]) -> int:
     """Checks all jobs, then has Hydra run them, past those that fail. Returns the exit code."""
     rank.refuse("The jobs of a sweep start their own ranks; leave torchrun out, and add ranks=")
@@ -127,7 +119,11 @@ def sweep(composer: Composer, words: list[str]) -> int:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
     _, jobs, config = jobs_of(composer, words)
     gpu_slots.check(jobs, config)
-    check_metric(metric, jobs)
+    trainings = [cfg for cfg in jobs if isinstance(cfg, settings.Train)]
+    has_evaluations = all(cfg.finish.evaluate or cfg.evaluation.every for cfg in trainings)
+    if metric.startswith("eval/") and not has_evaluations:
+        cure = "needs evaluations: finish.evaluate=true, or evaluation.every=1M"
+        raise ConfigErrors([("metric", cure)])
     folder = Path(config.sweep.dir)
     is_new, is_search = not folder.exists(), config.runtime.choices["hydra/sweeper"] == "optuna"
     with user_errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
@@ -159,8 +155,9 @@ def sweep(composer: Composer, words: list[str]) -> int:
     except Exception as error:  # a launcher's or a sweeper's
         problem = shortened(error, 400)
     finally:
-        lost = {"state": LOST}
-        if rows := [row | lost if row["state"] == RUNNING else row for row in job.rows()]:
+        rows = [*job.rows().values()]
+        rows = [row | {"state": LOST} if row["state"] == RUNNING else row for row in rows]
+        if rows:
             with console.warned(f"{folder} cannot be written: "):
                 write_table(folder, rows, is_printed=True)
         elif is_new:
@@ -201,24 +198,15 @@ def new_job(
 class Job:
     """What Hydra calls for a job, in whichever process a launcher starts; it records what became of
     the job. It composes again, as the machine may have another device.
-
-    Attributes:
-        source: the script's name, and the other arguments of the Composer.
-        folder: that of the sweep.
-        records: a folder of files about the jobs.
-        process: that of the sweep.
-        start: the folder it was started in.
-        metric: whose value is the score.
-        seeds: `seed=1` and so on of the runs of which each job is the mean; none: of itself.
     """
 
-    source: tuple
-    folder: str
-    records: str
-    process: int
-    start: str
-    metric: str
-    seeds: tuple[str, ...]
+    source: tuple  # the script's name, and the other arguments of the Composer
+    folder: str  # that of the sweep
+    records: str  # a folder of files about the jobs
+    process: int  # that of the sweep
+    start: str  # the folder it was started in
+    metric: str  # whose value is the score
+    seeds: tuple[str, ...]  # `seed=1` and so on of the runs of which each job is the mean
 
     def __call__(self, config: object) -> float | None:
         """Returns the job's score, None if it failed: a sweeper is to go on."""
@@ -248,12 +236,11 @@ class Job:
         joblib has a process of its own, so that one that is killed leaves the others.
         """
         number = row["number"]
-        if self.path(f"{number}.json").exists():
-            earlier = self.recorded(number)
+        if earlier := self.rows().get(number):
             return earlier if earlier["state"] == DONE else self.run(row, words, is_again=True)
         if not is_joblib:
             return self.run(row, words)
-        if self.path("stopped").exists():
+        if Path(self.records, "stopped").exists():
             return row
         workers.end_with_parent(self.process)
         self.record(row)
@@ -261,7 +248,7 @@ class Job:
         process = subprocess.Popen([sys.executable, "-c", ALONE, job])
         with workers.terminal_signals_blocked():
             process.wait()
-        ended = self.recorded(number)
+        ended = self.rows().get(number, row)
         if ended["state"] == RUNNING:
             ended["state"] = LOST
             self.record(ended)
@@ -269,9 +256,7 @@ class Job:
         return ended
 
     def run(self, row: "Row", words: list[str], is_again: bool = False) -> "Row":
-        """Runs a job in this process, from its checkpoint if it was started before. Returns its
-        row.
-        """
+        """Runs a job in this process, from its checkpoint if it is started again."""
         began, number, result = time.monotonic(), row["number"], None
         if os.getpid() != self.process:  # its lines are among those of others
             warnings.showwarning, console.prefix = console.warn, f"job {number}: "
@@ -311,37 +296,29 @@ class Job:
 
     def own_settings(self, cfg: settings.Train, folder: str, is_again: bool) -> settings.Train:
         """Returns the settings of a training with what differs for a job of a sweep."""
-        name = Path(self.folder).name
-        loggers = {
-            label: settings.changed(one, group=name) if getattr(one, "group", "") is None else one
-            for label, one in cfg.logger.items()
-        }
+        loggers = dict(cfg.logger)
+        for label, one in loggers.items():
+            if getattr(one, "group", "") is None:
+                loggers[label] = settings.changed(one, group=Path(self.folder).name)
         resume, folder = AUTO if is_again else cfg.resume, os.path.relpath(folder)
         return settings.changed(cfg, logger=loggers, folder=folder, resume=resume)
-
-    def path(self, name: str) -> Path:
-        return Path(self.records, name)
 
     def record(self, row: "Row") -> None:
         """Writes what is known of a job, and the table of all jobs so far."""
         with contextlib.suppress(OSError):  # a full disk: the job is worth more
-            write_atomically(self.path(f"{row['number']}.json"), json.dumps(row).encode())
-            write_table(Path(self.folder), self.rows())
+            path = Path(self.records, f"{row['number']}.json")
+            write_atomically(path, json.dumps(row).encode())
+            write_table(Path(self.folder), [*self.rows().values()])
 
-    def recorded(self, number: int) -> "Row":
-        """Returns what became of a job."""
-        with contextlib.suppress(OSError):  # of a full disk
-            return json.loads(self.path(f"{number}.json").read_text())
-        return {"number": number, "varied": {}, "state": RUNNING}
-
-    def rows(self) -> "list[Row]":
-        """Returns what the jobs of this sweep recorded, in order."""
-        return [self.recorded(n) for n in sorted(int(p.stem) for p in self.path("").glob("*.json"))]
+    def rows(self) -> "dict[int, Row]":
+        """Returns what the jobs of this sweep recorded, by number, in order."""
+        rows = [json.loads(path.read_text()) for path in Path(self.records).glob("*.json")]
+        return {row["number"]: row for row in sorted(rows, key=lambda row: row["number"])}
 
     def interrupt(self, number: int) -> NoReturn:
         """Has jobs in other processes save and end, then raises Interrupted."""
         with contextlib.suppress(OSError):
-            self.path("stopped").touch()
+            Path(self.records, "stopped").touch()
         deadline = time.monotonic() + 30  # seconds, for jobs to save
         for process in self.running():
             signals.stop(process)
@@ -351,8 +328,8 @@ class Job:
 
     def running(self) -> list[int]:
         here = RUNNING, socket.gethostname()
-        pids = [row["process"] for row in self.rows() if (row["state"], row.get("host")) == here]
-        return [pid for pid in pids if pid != os.getpid()]
+        rows = [one for one in self.rows().values() if (one["state"], one.get("host")) == here]
+        return [row["process"] for row in rows if row["process"] != os.getpid()]
 
 
 def run_job(text: str) -> None:

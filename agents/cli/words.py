@@ -91,9 +91,7 @@ def plain_tree(kind: Any, words: list[str]) -> Tree:
 
 
 def typed_of(arguments: Mapping[str, Any]) -> list[Typed]:
-    """Returns settings from keyword arguments: plain values, dotted keys, and dicts of a group's
-    keys.
-    """
+    """Returns settings from keyword arguments: values, dotted keys, and dicts of a group's keys."""
     typed = []
     for key, value in arguments.items():
         if isinstance(value, Mapping) and "." not in key:

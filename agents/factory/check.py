@@ -19,13 +19,7 @@ T = TypeVar("T")
 
 def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
     """Returns the settings of a dataclass, such as `settings.Train`, from nested dicts as YAML has
-    them: 1e6 counts as an integer, a list as a tuple.
-
-    Args:
-        names: more names to suggest for a mistyped key, such as groups.
-
-    Raises:
-        ConfigErrors: with everything that is wrong.
+    them. Raises ConfigErrors with everything that is wrong. `names` are more to suggest for a typo.
     """
     try:
         chosen = components.adapter(kind).validate_python(tree)
@@ -48,9 +42,7 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
 
 
 def as_tree(chosen: Any, prefix: str = "") -> Tree:
-    """The inverse of `check`, without defaults that only the constructor can give, such as
-    functions. Raises ConfigErrors for other values that no file can hold.
-    """
+    """The inverse of `check`. Raises ConfigErrors for values that no file can hold."""
     tree = {}
     for name, field in type(chosen).__pydantic_fields__.items():
         value = getattr(chosen, name)
@@ -76,10 +68,7 @@ def _plain(value, prefix="") -> Any:
 
 
 def fields_of(kind: type, tree: object, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (dotted key, pydantic's field) of every setting, and of every group of settings.
-
-    `tree` names the members of groups: which keys `env.` has depends on `env.name`.
-    """
+    """Yields (dotted key, pydantic's field) of the settings; `tree` names members of groups."""
     for name, field in kind.__pydantic_fields__.items():
         yield prefix + name, field
         value = tree.get(name) if isinstance(tree, dict) else None
@@ -105,9 +94,7 @@ def leaves(tree: Tree, prefix: str = "") -> list[tuple[str, Any]]:
 
 
 def closest_key(key: str, keys: Iterable[str]) -> str:
-    """Returns a hint that names the key nearest to one that there is not, or lists those of its
-    group if none is near.
-    """
+    """Returns a hint that names the nearest key, or lists those of the group if none is near."""
     # by the whole key or its last part: `lr` and `learner.lrr` find `learner.lr`
     names = [*keys]
     named = {name.rpartition(".")[2]: name for name in names} | {name: name for name in names}

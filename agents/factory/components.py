@@ -43,9 +43,7 @@ def _wrappers(value: object) -> tuple[object, ...]:
 
 
 def wrapper_settings(item: "str | dict") -> Any:
-    """Returns the settings of a wrapper, with the import path of its class as `name`. Raises
-    ValueError if they are not those of the class.
-    """
+    """Returns the settings of a wrapper. Raises ValueError if they are not those of its class."""
     tree = {"name": item} if isinstance(item, str) else item
     label = tree["name"]
     kind = kind_of("wrapper", path := members("wrapper").get(label, label))

@@ -149,9 +149,7 @@ def changes_lr(learner: "Learner") -> bool:
 
 
 def ignored_geometry(env: "Env | None", typed: list[str]) -> list[tuple[str, str]]:
-    """Returns [(key, sentence)] of the first typed key of a geometry, if the environment takes
-    none.
-    """
+    """Returns what is wrong with a typed geometry, if the environment takes none."""
     keys = [key for key in typed if key.split(".")[0] == "geometry"]
     if not keys or env is None or components.takes_geometries(env.name):
         return []

@@ -22,9 +22,8 @@ METHODS = "__init__", "reset", "step", "check", "desync"
 def caught(
     env: Env, folder: Path, saved: Callable[[], str] = lambda: "", rank: int = 0
 ) -> Iterator[None]:
-    """Turns an error of an environment into an EnvFailed, and writes its traceback into a file in a
-    folder. Errors of megastep's own code are raised as they are. `saved` returns what else to say,
-    such as the command that resumes.
+    """Turns an error of an environment of somebody else into an EnvFailed, and writes its traceback
+    into a folder. `saved` returns what else to say, such as the command that resumes.
     """
     try:
         yield

@@ -65,9 +65,7 @@ errors = functools.partial(user_errors, kinds=KINDS)
 
 
 def construct(settings: "Component", constructor: Callable | None = None, **arguments: Any) -> Any:
-    """Calls a class or function, by default the one at `settings.name`, with those of the settings
-    and arguments that it takes.
-    """
+    """Calls a class or function, by default `settings.name`, with the arguments that it takes."""
     with errors():
         is_env = constructor is None and hasattr(settings, "wrappers")
         constructor = constructor or import_object(settings.name)
@@ -139,9 +137,7 @@ def spread(homes: list[dict], n_envs: int) -> list[dict]:
 
 
 def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
-    """Returns a small environment of the same kind, which tells spaces and sizes. Raises UserError
-    with the clause of the contract that a class of the user's breaks.
-    """
+    """Returns a small environment of the same kind; one of a user's must keep the contract."""
     names = [item["name"] if isinstance(item, dict) else item for item in env.wrappers]
     is_ours = all(":" not in name for name in names) and env.name.startswith("megastep.")
     n_envs = 1 if is_ours else min(SAMPLE, env.n_envs)
@@ -155,9 +151,8 @@ def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
 def check_memory(
     env: Env, sample: types.Env, learner: object, geometries: list, n_members: int = 1, **arguments
 ) -> None:
-    """Raises UserError with the number that fits, if environments, a replay buffer or members of a
-    population need more than the memory. The `sample` counts what environments share; only if that
-    is too much, more of them are made.
+    """Raises UserError with the number that fits, if environments, a replay buffer or members need
+    more than the memory. The `sample` counts what environments share; if that is too much, more do.
     """
 
     def fit(bytes_each) -> None:
@@ -226,9 +221,7 @@ def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
 def make_opponents(
     cfg: Train, env: types.Env, sample: types.Env, policy: Policy, seed: int = 1
 ) -> Opponents | None:
-    """Returns the environment with opponents in it, None if there are to be none. A scripted one is
-    tried in a small `sample`. Raises UserError if one cannot play there or snapshots do not fit.
-    """
+    """Returns the environment with opponents in it, None if none. A `sample` tries the bot."""
     options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
     if not (cfg.opponents.past or cfg.opponents.bot or cfg.opponents.league):
         return None
@@ -244,11 +237,8 @@ def make_opponents(
 
 
 def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
-    """Returns a policy that needs no weights, given the environment's settings and the environment,
-    if it takes them. It takes one step there. Raises UserError if it cannot play.
-
-    Args:
-        name: one of `BOTS`, the import path of a class, or None, the class that is `env.bot`.
+    """Returns a policy without weights, which takes one step in `env`; UserError if it cannot play.
+    `name` is one of `BOTS`, the import path of a class, or None, the class that is `env.bot`.
     """
     where = type(env).__name__
     with errors():

@@ -1,7 +1,6 @@
 """The settings of the scripts as frozen dataclasses, checked by their annotations. Knows no Hydra.
 
-configs/ holds the defaults of a run. The settings of environments, geometries, learners, agents and
-opponents are the arguments of their constructors, with the bounds and defaults given there.
+Those of components are the arguments of their constructors; configs/ holds the defaults of a run.
 """
 
 import copy
@@ -122,9 +121,7 @@ def _default(group: str) -> Any:
 
 
 def changed(settings: T, **changes: object) -> T:
-    """Returns a copy of settings with other values. Nothing is checked again, since a stranger's
-    default need not be what its annotation says. Raises TypeError for a key that there is not.
-    """
+    """Returns a copy of settings with other values, which are not checked again."""
     result = copy.copy(settings)
     for name, value in changes.items():
         if not hasattr(settings, name):

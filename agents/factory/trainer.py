@@ -135,9 +135,7 @@ def make_trainer(
 
 
 def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint | None:
-    """Gives the policy the weights of the checkpoint that a run continues or starts from, if any.
-    Returns it.
-    """
+    """Gives the policy the weights of the checkpoint that `cfg` names, if any. Returns it."""
     if not (start := cfg.resume or cfg.init):
         return None
     path = folders.find(start)
