@@ -8,7 +8,7 @@ from pathlib import Path
 
 from megastep.agents import console
 from megastep.agents.distributed import process_group
-from megastep.agents.errors import UserError
+from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import evaluate_run, filming, tables
 from megastep.agents.factory import settings
 from megastep.agents.factory.trainer import make_loggers
@@ -73,7 +73,8 @@ def compare(folder: Path, original: Path) -> None:
             f"rerun={original.parent} repeats the whole population"
         )
     for name in names:
-        ours, theirs = ((one / name).read_bytes().split(b"\n") for one in (folder, original))
+        with user_errors("The runs cannot be compared: "):
+            ours, theirs = ((one / name).read_bytes().split(b"\n") for one in (folder, original))
         pairs = enumerate(itertools.zip_longest(ours, theirs), 1)
         if number := next((number for number, (one, other) in pairs if one != other), None):
             text = f"{name} differs from that of {original} from line {number} on; {cause}"

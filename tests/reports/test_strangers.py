@@ -1,5 +1,6 @@
 """Strangers' runs: nothing that a file names is imported, and an odd file is one sentence."""
 
+import hashlib
 import importlib
 import json
 import re
@@ -8,8 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from megastep.agents.cli import compare, evaluate, export, inspect, record, report, train, web
+from megastep.agents.runs import checkpoint
 from tests.helpers import tiny
 
 WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, f"samples={20 * tiny.UPDATE}", "logging.every=2"]
@@ -85,6 +88,83 @@ def test_what_files_name_is_not_imported(here, capsys):
     assert ends_well(inspect.main, ["P"], capsys) == 0
     assert ends_well(export.main, to_export, capsys) == 0, "without provenance"
     assert ends_well(web.main, ["run=P", "file=x.html"], capsys) == 2, "which needs another task"
+
+
+COMMANDS = {
+    "report": (report.main, ["run=[P/member-0,P/member-1]", "file=x.html"]),
+    "compare": (compare.main, ["run=P"]),
+    "evaluate": (evaluate.main, ["run=P", "episodes=2", "max_steps=2"]),
+    "record": (record.main, ["run=P", "steps=2", "file=x.png"]),
+    "inspect": (inspect.main, ["P"]),
+    "export": (export.main, ["run=P", "format=safetensors", "file=x.safetensors"]),
+    "web": (web.main, ["run=P", "file=x.html"]),
+    "init": (train.main, ["init=P", "samples=1", "folder=new"]),
+    "resume": (train.main, ["resume=P", "more_samples=1"]),
+    "rerun": (train.main, ["rerun=P", "folder=new"]),
+}
+
+
+def planted(text, read, dump):
+    """Yields a text with the marker in place of each string in it, one after the other."""
+
+    def strings(node):
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+            if isinstance(value, (dict, list)):
+                yield from strings(value)
+            elif isinstance(value, str):
+                yield node, key
+
+    tree = read(text)
+    for node, key in [*strings(tree)]:
+        value, node[key] = node[key], ODD[0]
+        yield dump(tree)
+        node[key] = value
+
+
+def lines(text):
+    return [*map(json.loads, text.splitlines())]
+
+
+def variants(folder):
+    """Yields a population in turn with the marker in each string of each of its files; those of a
+    checkpoint are sealed anew, as a stranger can.
+    """
+    for file in sorted(folder.rglob("*.*")):
+        read, dump = {
+            ".json": (json.loads, json.dumps),
+            ".jsonl": (lines, lambda rows: "".join(json.dumps(row) + "\n" for row in rows)),
+            ".yaml": (yaml.safe_load, yaml.safe_dump),
+        }.get(file.suffix, (None, None))
+        text, manifest = read and file.read_text(), file.with_name("manifest.json")
+        seal = manifest.read_bytes() if read and manifest.exists() else None
+        for other in planted(text, read, dump) if read else ():
+            file.write_text(other)
+            if seal is not None:
+                tree = {k: v for k, v in json.loads(manifest.read_text()).items() if k != "sha256"}
+                if file != manifest:
+                    digest = hashlib.sha256(other.encode()).hexdigest()
+                    tree["files"][file.name] = {"sha256": digest, "bytes": len(other)}
+                manifest.write_bytes(checkpoint.sealed(tree))
+            yield file
+            if seal is not None:
+                manifest.write_bytes(seal)
+        if read:
+            file.write_text(text)
+
+
+@pytest.mark.parametrize(
+    "every", [pytest.param(12, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)]
+)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_string_of_a_population_is_imported(here, name, every, capsys):
+    """In each string of each file a marker: nothing runs, and each end is a sentence."""
+    (main, words), n = COMMANDS[name], 0
+    for n, file in enumerate(variants(here / "P")):
+        if (n + len(name)) % every == 0:
+            ends_well(main, words, capsys)
+            shutil.rmtree("new", ignore_errors=True)
+            assert not Path("imported").exists(), file
+    assert n > 150
 
 
 CONFIGS = {
