@@ -7,9 +7,8 @@ cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell w
 additions away.
 
 `lstm_sequence` is the recurrence in PyTorch. A CPU runs a whole sequence in one kernel, and so does
-a GPU with clusters of blocks (Hopper and later); others run one kernel per step between two
-products. When acting, a GPU has one product of inputs and last outputs, or with few lanes one
-kernel for all.
+a GPU with clusters of blocks (Hopper and later). When acting, a GPU has one product of inputs and
+last outputs, or with few lanes one kernel for all.
 """
 
 from collections.abc import Callable
@@ -67,48 +66,6 @@ class Form(NamedTuple):
     #: Returns the gradients of the gates (T, B, 4 W), of the bias (4 W,), of the output and the
     #: cell before the sequence, (B, W), and of the inputs, None if left to the caller.
     backward: Callable[..., tuple]
-
-
-# ---- On a GPU, step by step ----
-
-
-def _forward_in_steps(x, input_weight, bias, weight, reset, output, cell, saves, residual) -> tuple:
-    gates = F.linear(x, input_weight, bias)
-    outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
-    is_first = reset[0, :, None]
-    hiddens[0], cells = output.masked_fill(is_first, 0.0), [cell.masked_fill(is_first, 0.0)]
-    next_steps = [*zip(reset[1:], hiddens[1:], strict=True), (None, None)]
-    for t, (next_reset, next_hidden) in enumerate(next_steps):
-        gates[t].addmm_(hiddens[t], weight.T)
-        cells.append(torch.empty_like(cell))
-        launch_units(
-            *("lstm_forward", x.dtype, cell),
-            **dict(gates=gates[t], cell=cells[t], next_reset=next_reset, output=outputs[t]),
-            **dict(next_hidden=next_hidden, next_cell=cells[t + 1]),
-        )
-    last = outputs[-1].float()
-    outputs = outputs if residual is None else outputs + residual
-    return outputs, hiddens, last, cells[-1], (gates, *cells[:-1])
-
-
-def _backward_in_steps(input_weight, weight, reset, saved, d_outputs, d_cell) -> tuple:
-    gates, *cells = saved
-    d_gates = torch.empty_like(gates)
-    d_cell = torch.zeros_like(cells[0]) if d_cell is None else d_cell
-    next_reset = d_hidden = None
-    for t in reversed(range(len(reset))):
-        d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
-        launch_units(
-            *("lstm_backward", gates.dtype, d_cell),
-            **dict(gates=gates[t], cell=cells[t], next_reset=next_reset, d_output=d_outputs[t]),
-            **dict(d_next_hidden=d_hidden, d_next_cell=d_next_cell),
-            **dict(d_gates=d_gates[t], d_cell=d_cell),
-        )
-        next_reset, d_hidden = reset[t], d_gates[t] @ weight
-    assert d_hidden is not None
-    is_reset = reset[0, :, None]
-    d_states = d_hidden.float().masked_fill_(is_reset, 0.0), d_cell.masked_fill_(is_reset, 0.0)
-    return d_gates, d_gates.flatten(0, 1).sum(0), *d_states, None
 
 
 # ---- On a GPU with clusters of blocks: the recurrent weights stay on the chip ----
@@ -206,7 +163,6 @@ def _backward_on_cpu(input_weight, weight, reset, saved, d_outputs, d_cell) -> t
 # ---- The recurrence with an explicit gradient ----
 
 
-IN_STEPS = Form(_forward_in_steps, _backward_in_steps)
 ON_CLUSTERS = Form(_forward_on_clusters, _backward_on_clusters)
 ON_CPU = Form(_forward_on_cpu, _backward_on_cpu)
 
@@ -269,7 +225,6 @@ def _by(form) -> Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
     ),
 )
 @fused(_by(ON_CLUSTERS), _fits_clusters)
-@fused(_by(IN_STEPS), lambda x, *_: x.is_cuda and x.dtype in DTYPES)
 def lstm_sequence(
     x: torch.Tensor,
     input_weight: torch.Tensor,

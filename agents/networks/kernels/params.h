@@ -3,9 +3,8 @@
 // T steps, B lanes, W units. "compute" is the dtype of matrix products, float32 or bfloat16.
 #pragma once
 
-// The LSTM. Gates are before activation, in the order input, forget, candidate, output. `hidden`
-// and `cell` are a step's input state: the last step's output and cell, zeroed where a reset clears
-// them. A null pointer means that there is no next step.
+// A step of the LSTM, acting. Gates are before activation, in the order input, forget, candidate,
+// output.
 
 struct LstmJoinParams {
     const unsigned char* reset;  // (B)
@@ -25,32 +24,6 @@ struct LstmActParams {
     void* output;                // (B, W) compute
     float* next_output;          // (B, W), the same numbers without the residual
     float* next_cell;            // (B, W)
-    int n_lanes;
-    int width;
-    int n_units;  // units per thread
-};
-
-struct LstmForwardParams {
-    const void* gates;                // (B, 4 W) compute
-    const float* cell;                // (B, W)
-    const unsigned char* next_reset;  // (B)
-    void* output;                     // (B, W) compute
-    void* next_hidden;                // (B, W) compute
-    float* next_cell;                 // (B, W)
-    int n_lanes;
-    int width;
-    int n_units;  // units per thread
-};
-
-struct LstmBackwardParams {
-    const void* gates;                // (B, 4 W) compute
-    const float* cell;                // (B, W)
-    const unsigned char* next_reset;  // (B)
-    const void* d_output;             // (B, W) compute
-    const void* d_next_hidden;        // (B, W) compute
-    const float* d_next_cell;         // (B, W)
-    void* d_gates;                    // (B, 4 W) compute
-    float* d_cell;                    // (B, W)
     int n_lanes;
     int width;
     int n_units;  // units per thread
