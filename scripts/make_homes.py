@@ -22,7 +22,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from megastep.geometries import databases, homes
-from megastep.geometries.homes import plan
 from scripts import check_homes
 
 # Of real homes, from CubiCasa5k and Raster-to-Vector: (statistic, percentile, min, max).
@@ -108,18 +107,8 @@ def main(argv=None):
     parser.add_argument("--density", type=float, default=1, help="1 to 3; with --dry")
     parser.add_argument("--clutter", type=float, default=0, help="0 to 1; with --dry")
     args = parser.parse_args(argv)
-    if args.count < 2 or not args.dry and args.count != databases.COUNT:
-        parser.error(
-            f"--count {args.count}: take at least 2 with --dry, and {databases.COUNT} without"
-        )
-
-    if not 1 <= args.density <= plan.DENSEST or not args.dry and args.density != 1:
-        parser.error(
-            f"--density {args.density}: take 1 to {plan.DENSEST} with --dry, and 1 without"
-        )
-    if not 0 <= args.clutter <= 1 or not args.dry and args.clutter != 0:
-        parser.error(f"--clutter {args.clutter}: take 0 to 1 with --dry, and 0 without")
-
+    if not args.dry and (args.count, args.density, args.clutter) != (databases.COUNT, 1, 0):
+        parser.error("--count, --density and --clutter need --dry")
     with futures.ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         options = map(itertools.repeat, (args.density, args.clutter))
         results = list(pool.map(generate, range(args.count), *options, chunksize=50))

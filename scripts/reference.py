@@ -306,11 +306,10 @@ def _metrics_page():
 
 def _benchmarks():
     sys.path.append(str(Path(__file__).parent / "benchmarks"))
-    import paths
     import records
     import report
 
-    return report.page(records.read(paths.RECORDS))
+    return report.page(records.read(records.RECORDS))
 
 
 #: What the words of a generated block make.

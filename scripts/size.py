@@ -20,12 +20,7 @@ KERNELS = "*.h", "*.cu", "*.cpp"
 #: Commands whose way from the settings to the first rollout is measured.
 COMMANDS = {
     "explorer": ["env=explorer", "geometry=box"],
-    "deathmatch": [
-        "experiment=deathmatch",
-        "geometry=box",
-        "env.n_envs=16",
-        "checkpoints.snapshots=0",
-    ],
+    "deathmatch": ["experiment=deathmatch", "geometry=box", "env.n_envs=16"],
     "gymnasium": ["env=gymnasium", "env.id=CartPole-v1", "env.n_envs=8"],
 }
 WAYS = {
@@ -59,13 +54,8 @@ def sizes() -> Iterator[tuple[str, int]]:
     decisions = [page for page in tracked(["docs/decisions"], ("*.md",)) if page.stem != "README"]
     yield "docs/decisions, pages", len(decisions)
     yield "CHANGELOG.md, lines", n_lines("CHANGELOG.md", patterns=("*.md",))
-    yield (
-        "longest file, lines",
-        max(
-            len(path.read_bytes().splitlines())
-            for path in tracked(["agents", "megastep"], ("*.py",))
-        ),
-    )
+    paths = tracked(["agents", "megastep"], ("*.py",))
+    yield "longest file, lines", max(len(path.read_bytes().splitlines()) for path in paths)
 
 
 class Way:
@@ -136,7 +126,7 @@ def measure(name: str) -> Way:
     way = Way()
     if name in COMMANDS:
         way = Way(until="trainer.train")
-        train([*COMMANDS[name], "samples=1"], way)
+        train([*COMMANDS[name], "samples=1", "checkpoints.snapshots=0"], way)
     elif name == "update":
         train([*COMMANDS["explorer"], "samples=2e4", "callbacks=[size:SecondUpdate]"])
         import size  # the callback's module, which is not __main__

@@ -111,7 +111,6 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.web.page",
     "megastep.web.program",
     "megastep.web.recording",
-    "megastep.web.scene",
     "megastep.workers",
     "megastep.wrappers",
 }

@@ -24,7 +24,6 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # idle threads of PyTorch must not spin
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # this checkout comes first
 
-import paths
 import records
 import report
 import torch
@@ -103,7 +102,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def run(arguments: argparse.Namespace) -> None:
     if arguments.benchmarks == ["report"]:
-        report.write(arguments.json or paths.RECORDS)
+        report.write(arguments.json or records.RECORDS)
         return
     check_names(arguments.benchmarks)
     device = engine.device(arguments.device)

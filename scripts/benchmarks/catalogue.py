@@ -10,24 +10,8 @@ from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
 from populations import members, small_members
 from scaling import scaling
-from startup_times import startup
-from training import train
+from training import startup, train
 
-BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
-    "step": step,
-    "objects": objects,
-    "mazes": mazes,
-    "kernels": kernels,
-    "observe": observe,
-    "agents": agents,
-    "deathmatch": deathmatch,
-    "memory": memory,
-    "adapters": adapters,
-    "pong": pong,
-    "startup": startup,
-    "cpu": cpu,
-    "train": train,
-    "scaling": scaling,
-    "members": members,
-    "small_members": small_members,
-}
+ALL = (step, objects, mazes, kernels, observe, agents, deathmatch, memory, adapters, pong, startup)
+ALL += (cpu, train, scaling, members, small_members)
+BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {one.__name__: one for one in ALL}

@@ -11,7 +11,9 @@ from datetime import date
 from pathlib import Path
 
 import torch
-from paths import ROOT
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDS = ROOT / "docs" / "lab" / "benchmarks.jsonl"
 
 
 def read(path: Path) -> list[dict]:

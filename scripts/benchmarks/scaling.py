@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 
 import torch
-from paths import ROOT
+from records import ROOT
 from timing import measurement
 from training import rates, trained
 

@@ -1,4 +1,4 @@
-"""The benchmark `train`, and training in processes of their own for other benchmarks."""
+"""The benchmarks `train` and `startup`, and training in processes of their own for others."""
 
 import contextlib
 import itertools
@@ -6,15 +6,17 @@ import json
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
-from paths import ROOT
+from records import ROOT
 from timing import measurement
 
 BUDGETS, SEEDS = (6, 30), (1, 2, 3)
 MAX_CURVE_POINTS = 50
+N_PROCESSES = 3  # samples of what takes a process each
 #: (seconds of training, samples, return)
 CurvePoint = tuple[float, int, float]
 
@@ -37,6 +39,23 @@ def train(
             yield dict(what=f"{what}, {agent} in unseen homes", unit="", n=row["homes"]) | interval
         if len(curve) > 1:
             yield training_rate(what, curve)
+
+
+def startup(device: torch.device) -> Iterator[dict]:
+    """From the command `python train.py geometry=bench` to the end of its first update, with warm
+    caches.
+    """
+    seconds = []
+    for _ in range(N_PROCESSES + 1):  # the first fills the caches
+        with tempfile.TemporaryDirectory() as folder:
+            command = [sys.executable, "train.py", "geometry=bench", "samples=1", "logging.every=1"]
+            command += [f"folder={folder}/run", f"device={device}"]
+            start = time.perf_counter()
+            with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+                next(line for line in process.stdout if " samples" in line)
+                seconds.append(time.perf_counter() - start)
+                process.communicate()
+    yield measurement("command to first update, warm cache", "s", seconds[1:])
 
 
 @contextlib.contextmanager

@@ -21,13 +21,7 @@ from megastep import adapters, envs, spaces, toys
 
 N_EPISODES = 512
 #: Samples of each library's training.
-BUDGETS = dict(
-    sb3=500_000,
-    sb3_recurrent=120_000,
-    torchrl=500_000,
-    rsl_rl=1_000_000,
-    skrl=500_000,
-)
+BUDGETS = dict(sb3=500_000, sb3_recurrent=120_000, torchrl=500_000, rsl_rl=1_000_000, skrl=500_000)
 
 
 def pong(n_envs, device, seed=1):
@@ -208,40 +202,25 @@ def train_skrl(samples, device, n_envs=64):
     from skrl.trainers.torch import SequentialTrainer
     from skrl.utils import set_seed
 
-    class Network(nn.Sequential):
-        def __init__(self, n_out):
-            super().__init__(
-                *(nn.Linear(8, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, n_out))
-            )
+    def model(mixin, n_out):
+        """Returns a class of models, as skrl makes them from a base and a mixin."""
 
-    class Policy(CategoricalMixin, Model):
-        def __init__(self, env):
-            Model.__init__(
-                self,
-                observation_space=env.observation_space,
-                action_space=env.action_space,
-                device=device,
-            )
-            CategoricalMixin.__init__(self)
-            self.network = Network(3)
+        class Network(mixin, Model):
+            def __init__(self, env):
+                spaces = dict(
+                    observation_space=env.observation_space, action_space=env.action_space
+                )
+                Model.__init__(self, **spaces, device=device)
+                mixin.__init__(self)
+                hidden = nn.Linear(8, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh()
+                self.network = nn.Sequential(*hidden, nn.Linear(64, n_out))
 
-        def compute(self, inputs, role):
-            return self.network(inputs["observations"]), {}
+            def compute(self, inputs, role):
+                return self.network(inputs["observations"]), {}
 
-    class Value(DeterministicMixin, Model):
-        def __init__(self, env):
-            Model.__init__(
-                self,
-                observation_space=env.observation_space,
-                action_space=env.action_space,
-                device=device,
-            )
-            DeterministicMixin.__init__(self)
-            self.network = Network(1)
+        return Network
 
-        def compute(self, inputs, role):
-            return self.network(inputs["observations"]), {}
-
+    Policy, Value = model(CategoricalMixin, 3), model(DeterministicMixin, 1)
     set_seed(1)
     vector = adapters.VectorEnv(pong(n_envs, device), "same_step")
     env = wrap_env(vector, wrapper="gymnasium")

@@ -5,7 +5,6 @@ import re
 
 import benchmark
 import numpy as np
-import paths
 import pytest
 import records
 
@@ -55,12 +54,12 @@ HEADLINES = [
 
 
 def tables_of(page):
-    return [line.split(" | ") for line in (paths.ROOT / page).read_text().splitlines()]
+    return [line.split(" | ") for line in (records.ROOT / page).read_text().splitlines()]
 
 
 def values_of(what):
     """Returns the newest records on an H200 whose names match a regular expression."""
-    rows = records.newest(records.read(paths.RECORDS))
+    rows = records.newest(records.read(records.RECORDS))
     found = [r for r in rows if re.fullmatch(what, r["what"]) and r["on"] == "NVIDIA H200"]
     return sorted(r["value"] for r in found)
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import train_plain
-from paths import ROOT
+from records import ROOT
 
 TINY = "experiment=deathmatch geometry=box env.n_envs=8 seconds=null finish.record=false"
 
