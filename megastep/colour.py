@@ -3,7 +3,7 @@
 """
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,26 +17,22 @@ _SLOPE, _SCALE, _POWER = 12.92, 1.055, 2.4
 
 def gamma_encode(light: Values) -> Values:
     """Returns the sRGB values of linear light. Images must be encoded before they are shown."""
-    return _piecewise(
-        light, _KNEE, lambda x: _SLOPE * x, lambda x: _SCALE * x ** (1 / _POWER) - (_SCALE - 1)
-    )
+    x, above, where = _above(light, _KNEE)
+    return where(x <= _KNEE, _SLOPE * x, _SCALE * above ** (1 / _POWER) - (_SCALE - 1))
 
 
 def gamma_decode(values: Values) -> Values:
     """Returns the linear light of sRGB values: the inverse of :func:`gamma_encode`."""
-    return _piecewise(
-        values,
-        _SLOPE * _KNEE,
-        lambda x: x / _SLOPE,
-        lambda x: ((x + (_SCALE - 1)) / _SCALE) ** _POWER,
-    )
+    x, above, where = _above(values, _SLOPE * _KNEE)
+    curve = ((above + (_SCALE - 1)) / _SCALE) ** _POWER
+    return where(x <= _SLOPE * _KNEE, x / _SLOPE, curve)
 
 
-def _piecewise(x: Values, knee: float, line: Callable, curve: Callable) -> Values:
-    """Returns ``line(x)`` up to the knee and ``curve(x)`` above it, in the float dtype of ``x``."""
+def _above(x, knee: float) -> tuple[Any, Any, Callable]:
+    """Returns ``x`` in floats, the same but no less than the knee, and its library's ``where``."""
     if isinstance(x, torch.Tensor):
         x = x if x.is_floating_point() else x.float()
-        return torch.where(x <= knee, line(x), curve(x.clamp(min=knee)))
+        return x, x.clamp(min=knee), torch.where
     x = np.asarray(x)
     x = x if np.issubdtype(x.dtype, np.floating) else x.astype(float)
-    return np.where(x <= knee, line(x), curve(np.maximum(x, x.dtype.type(knee))))
+    return x, np.maximum(x, x.dtype.type(knee)), np.where

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from megastep.colour import *  # noqa: F403
-    from megastep.plotting.images import *  # noqa: F403
     from megastep.plotting.marks import *  # noqa: F403
     from megastep.plotting.pictures import *  # noqa: F403
     from megastep.plotting.plans import *  # noqa: F403
@@ -22,9 +21,8 @@ if TYPE_CHECKING:
 _MODULES = {
     "megastep.colour": "gamma_decode gamma_encode",
     "megastep.plotting.styles": "AGENTS Style current styled",
-    "megastep.plotting.images": "STRIP camera_colours plot_images",
-    "megastep.plotting.marks": "plot_agent plot_goal plot_object plot_shot plot_trail plot_view "
-    "view_polygon",
+    "megastep.plotting.marks": "STRIP camera_colours plot_agent plot_goal plot_images plot_object "
+    "plot_shot plot_trail plot_view view_polygon",
     "megastep.plotting.plans": "plot_scenery wall_colours",
     "megastep.plotting.pictures": "Area Picture captioned encoded framed panels plot_level "
     "rasterise side_by_side",

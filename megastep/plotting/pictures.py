@@ -327,7 +327,7 @@ def _write_head(picture, height, numbers) -> None:
     for words, y, size, bold in (line, 0.2, 13, False), (style.title, tall - 0.22, 15, True):
         if words:
             look = bold, style.colours.text, picture.dpi
-            while _line(words, size, *look)[1] > width * picture.dpi:
+            while size > 1 and _line(words, size, *look)[1] > width * picture.dpi:
                 size *= 0.95
             head.text((0, y), words, size=size, bold=bold)
 
