@@ -105,8 +105,7 @@ def sizes(cfg: settings.Train, device) -> dict[str, int]:
 
         with factory.errors():
             shares = opponents.past, opponents.bot, opponents.snapshots, opponents.league
-            n_snapshot, n_bot, n_rival = count_environments(sample, cfg.env.n_envs, *shares)
-        n_played = (n_snapshot + n_rival) * opponents.snapshots + n_bot
+            n_played = sum(count_environments(sample, cfg.env.n_envs, *shares).values())
         lanes -= n_played * (optional(sample, "n_agents") - 1)
         numbers["lanes that learn"] = lanes
     if learner.n_steps:

@@ -76,9 +76,7 @@ class Opponents:
         self.env, self.every, device = env, every, env.device
         self.n_agents = optional(env, "n_agents")
         self.scripted = scripted if bot else None
-        n_per_snapshot, n_bot, n_per_rival = count_environments(
-            env, env.n_envs, past, bot, snapshots, league
-        )
+        self.n_by_kind = count_environments(env, env.n_envs, past, bot, snapshots, league)
         if bot and scripted is None:
             raise ValueError(
                 f"opponents.bot={bot} needs a bot that plays: pass scripted=, a policy, or bot=0"
@@ -88,26 +86,19 @@ class Opponents:
             [policy.actor().requires_grad_(True) for _ in range(snapshots if share else 0)]
             for share in (past, league)
         )
+        self.copies = [*self.snapshots, *self.rivals]
         self.generator = SeededGenerator(stream_seed(seed, "opponents"))
-        n_by_opponent = [n_per_snapshot] * len(self.snapshots) + [n_per_rival] * len(self.rivals)
-        n_by_opponent += [n_bot] * (n_bot > 0)
-        self.n_opposed = sum(n_by_opponent)
-        self.n_by_kind = {
-            "past": n_per_snapshot * len(self.snapshots),
-            "league": n_per_rival * len(self.rivals),
-            "bot": n_bot,
-        }
-        self.slots = torch.cat(  # (M, 1)
-            [rotating_slots(n, self.n_agents, device) for n in n_by_opponent]
-        )
+        kinds = {"past": len(self.snapshots), "league": len(self.rivals), "bot": int(bot > 0)}
+        n_each = [self.n_by_kind[kind] // n for kind, n in kinds.items() for _ in range(n)]
+        self.n_opposed = sum(n_each)
+        self.slots = torch.cat([rotating_slots(n, self.n_agents, device) for n in n_each])  # (M, 1)
         learners = torch.ones(env.n_envs, self.n_agents, dtype=torch.bool, device=device)
         learners[-self.n_opposed :] = torch.zeros_like(self.slots, dtype=torch.bool)
         learners[-self.n_opposed :].scatter_(1, self.slots, True)
         self.learners = learners.flatten()
-        opponent_lanes = (~self.learners).nonzero()[:, 0]
-        n_lanes_by_opponent = [n * (self.n_agents - 1) for n in n_by_opponent]
-        opponents = [*self.snapshots, *self.rivals, scripted][: len(n_by_opponent)]
-        self.mixed_policy = MixedPolicy(opponents, opponent_lanes.split(n_lanes_by_opponent))
+        lanes = (~self.learners).nonzero()[:, 0].split([n * (self.n_agents - 1) for n in n_each])
+        bots = [] if self.scripted is None else [self.scripted]
+        self.mixed_policy = MixedPolicy([*self.copies, *bots], lanes)
         n_by_kind = {"now": env.n_envs - self.n_opposed, **self.n_by_kind}
         n_lanes = torch.tensor(list(n_by_kind.values())) * self.n_agents
         kind = torch.arange(len(n_by_kind)).repeat_interleave(n_lanes).to(device)
@@ -184,9 +175,8 @@ class Opponents:
 
     def refresh_snapshots(self, policy: Policy, n_updates: int) -> None:
         """Copies the policy into the oldest snapshot, every `every` updates. Called after each."""
-        if not self.snapshots or n_updates % self.every:
-            return
-        self._refresh((n_updates // self.every - 1) % len(self.snapshots), policy)
+        if self.snapshots and n_updates % self.every == 0:
+            self._refresh((n_updates // self.every - 1) % len(self.snapshots), policy)
 
     def is_due(self, n_updates: int) -> bool:
         """Returns whether `refresh_rival` replaces one after so many updates."""
@@ -200,14 +190,14 @@ class Opponents:
 
     def refresh_rival(self, policy: Policy, n_updates: int) -> None:
         """Copies another member's policy into the oldest of the rivals. Called when `is_due`."""
-        number = n_updates // self.every - 1
-        self._refresh(len(self.snapshots) + number % len(self.rivals), policy)
+        number = (n_updates // self.every - 1) % len(self.rivals)
+        self._refresh(len(self.snapshots) + number, policy)
 
     def _refresh(self, index: int, policy: Policy) -> None:
-        snapshot, weights = [*self.snapshots, *self.rivals][index], policy.state_dict()
-        snapshot.load_state_dict({name: weights[name] for name in snapshot.state_dict()})
+        copy, weights = self.copies[index], policy.state_dict()
+        copy.load_state_dict({name: weights[name] for name in copy.state_dict()})
         state = self.hidden_state[str(index)]
-        state[:] = snapshot.initial(self.mixed_policy.sizes[index], self.env.device)
+        state[:] = copy.initial(self.mixed_policy.sizes[index], self.env.device)
 
     def pop_win_rates(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
@@ -223,21 +213,18 @@ class Opponents:
         Args:
             sum_over_ranks: adds the numbers of the other ranks, where there are any.
         """
-        win_rates, parts = {}, self.pairs.split([*self.n_by_kind.values()], 1)
-        sums = sum_over_ranks(torch.stack([pairs.double().sum(1) for pairs in parts]))
-        for name, (won, decided) in zip(self.n_by_kind, sums.tolist(), strict=True):
-            if decided:
-                win_rates[f"episode/won/{name}"] = won / decided
+        parts = self.pairs.split([*self.n_by_kind.values()], 1)
+        sums = sum_over_ranks(torch.stack([pairs.double().sum(1) for pairs in parts])).tolist()
         self.pairs.zero_()
-        return win_rates
+        both = zip(self.n_by_kind, sums, strict=True)
+        return {f"episode/won/{name}": won / decided for name, (won, decided) in both if decided}
 
     def state_dict(self) -> StateDict:
         """Returns the snapshots, the generator's state, and by lane what opponents see and remember
         and the scores of the episodes in progress.
         """
-        opponents = [*self.snapshots, *self.rivals]
         return dict(
-            snapshots={str(i): policy.state_dict() for i, policy in enumerate(opponents)},
+            snapshots={str(i): policy.state_dict() for i, policy in enumerate(self.copies)},
             generator=self.generator.state_dict(),
             lanes=dict(self._lanes(), pairs=self.pairs.clone()),  # a report clears the pairs
         )
@@ -246,14 +233,13 @@ class Opponents:
         """Restores a `state_dict`. Without `lanes`, the opponents begin new episodes. Raises
         ValueError if it has another number of snapshots.
         """
-        opponents = [*self.snapshots, *self.rivals]
-        if len(state["snapshots"]) != len(opponents):
+        if len(state["snapshots"]) != len(self.copies):
             raise ValueError(
                 f"the saved opponents have {len(state['snapshots'])} snapshots, these have "
-                f"{len(opponents)}: use the opponents.snapshots and opponents.past of the run"
+                f"{len(self.copies)}: use the opponents.snapshots and opponents.past of the run"
             )
-        for i, snapshot in enumerate(opponents):
-            snapshot.load_state_dict(state["snapshots"][str(i)])
+        for i, copy in enumerate(self.copies):
+            copy.load_state_dict(state["snapshots"][str(i)])
         self.generator.load_state_dict(state["generator"], self.learners.device)
         if "lanes" in state:
             copy_tree(self._lanes(), state["lanes"])
@@ -265,36 +251,33 @@ class Opponents:
 
 def count_environments(
     env: Env, n_envs: int, past: float, bot: float, snapshots: int, league: float = 0.0
-) -> tuple[int, int, int]:
-    """Returns the number of environments per snapshot, against the bot, and per snapshot of another
-    member. Raises ValueError as `Opponents`.
+) -> dict[str, int]:
+    """Returns the number of environments against snapshots, against those of other members, and
+    against the bot. Raises ValueError as `Opponents`.
     """
     if optional(env, "n_agents") < 2:
         raise ValueError(
             f"opponents need an environment with at least two agents; {type(env).__name__} has one"
         )
-    if not past + bot + league:
-        raise ValueError(
-            "opponents need opponents.past or opponents.bot above 0; without opponents, use the "
-            "environment itself"
-        )
-    if past + bot + league > 1:
+    if not 0 < past + bot + league <= 1:
         others = f", opponents.league={league}" if league else ""
         raise ValueError(
             f"opponents.past={past}{others} and opponents.bot={bot} are fractions of the "
-            "environments, so their sum must be at most 1"
+            "environments, so their sum must be above 0 and at most 1"
         )
-    n_past, n_bot, n_league = (round(share * n_envs) for share in (past, bot, league))
-    for name, share, n in (("past", past, n_past), ("league", league, n_league)):
-        if share and n < snapshots:
+    counts = {}
+    for name, share, n_players in ("past", past, snapshots), ("league", league, snapshots):
+        n = round(share * n_envs)
+        if share and n < n_players:
             raise ValueError(
                 f"opponents.{name}={share} of {n_envs:,} environments is {n:,} environments, too "
                 f"few for opponents.snapshots={snapshots:,}: reduce opponents.snapshots or raise "
                 "env.n_envs"
             )
-    if bot and not n_bot:
+        counts[name] = n - n % n_players
+    if bot and not round(bot * n_envs):
         raise ValueError(
             f"opponents.bot={bot} of {n_envs:,} environments is none: raise opponents.bot or "
             "env.n_envs"
         )
-    return n_past // snapshots, n_bot, n_league // snapshots
+    return {**counts, "bot": round(bot * n_envs)}

@@ -118,7 +118,7 @@ def test_dry_run_counts_lanes_that_learn(here, capsys):
     # six environments have opponents, two each
     assert str(30 - 6 * 2) in learn and str(8 * (30 - 6 * 2)) in update
     assert train.main([*duels, *sizes, "opponents.past=0.9", "opponents.bot=0.2"]) == 2
-    assert "their sum must be at most 1" in capsys.readouterr().err
+    assert "their sum must be above 0 and at most 1" in capsys.readouterr().err
 
 
 # ---- What the ranks' endings mean for the process that launched them ----

@@ -165,7 +165,7 @@ def test_opponents_act_on_a_copy_of_observations():
         (dict(past=0.7, bot=0.4), "opponents.past=0.7 and opponents.bot=0.4"),
         (dict(past=0.5, snapshots=9), "is 8 environments.*opponents.snapshots=9"),
         (dict(bot=0.01), "opponents.bot=0.01 of 16 environments is none.*env.n_envs"),
-        (dict(past=0.0, bot=0.0), "opponents.past or opponents.bot above 0"),
+        (dict(past=0.0, bot=0.0), "so their sum must be above 0"),
         (dict(scripted=None), "opponents.bot=0.25 needs a bot that plays: pass scripted="),
         (dict(past=1.5), "past: 1.5"),
         (dict(snapshots=0), "snapshots: 0"),
