@@ -1,7 +1,6 @@
 """A bot that plays Deathmatch. n lanes, A agents per environment, L landmarks per plan."""
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -32,11 +31,9 @@ class Hunter(Explorer):
         if not {"d", "health"} <= {*env.obs_space} or env.n_agents < 2:
             raise ValueError("it hunts by the observations d and health, as Deathmatch has them")
 
-    def act(
-        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
-    ) -> tuple[arrdict, arrdict]:
+    def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
         steering, obs = self.steering, world["obs"]
-        state = self.explore(world["reset"], state, pose, near)
+        state = self._explore(world["reset"], state, pose, near)
         other, sees = self._nearest(pose, obs["d"])
         # where to search for the other once it is lost from sight
         lengths = steering.lengths(steering.near(other))

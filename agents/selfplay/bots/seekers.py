@@ -3,12 +3,11 @@
 They know their pose and walk along shortest paths; they differ in what they know of the objects.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 
-from megastep.agents.selfplay.bots.steering import REACH, Pose, SteeredBot
+from megastep.agents.selfplay.bots.steering import REACH, SteeredBot
 from megastep.agents.selfplay.bots.walker import Explorer, Walker
 from megastep.arrdict import arrdict
 
@@ -36,12 +35,10 @@ class Oracle(SteeredBot):
             stay=torch.zeros(n_lanes, dtype=torch.int64, device=device),
         )
 
-    def act(
-        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
-    ) -> tuple[arrdict, arrdict]:
-        return self.unstick(self.walk_to(*self.ways(pose, near), pose, near), state, pose)
+    def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
+        return self._unstuck(self._walk_to(*self._ways(pose, near), pose, near), state, pose)
 
-    def unstick(self, decision: arrdict, state: Mapping, pose: Pose) -> tuple[arrdict, arrdict]:
+    def _unstuck(self, decision, state, pose) -> tuple[arrdict, arrdict]:
         """Returns the decision, to turn where a lane does not leave a place, and the next state.
 
         Where none of the few directions in which it can push brings a lane on, it would stand or
@@ -54,11 +51,11 @@ class Oracle(SteeredBot):
         turn = arrdict(actions=self.steering.turn.expand_as(decision["actions"]))
         return _chosen(is_stuck, turn, decision), arrdict(state, place=place, stay=stay)
 
-    def cued(self) -> torch.Tensor:
+    def _cued(self) -> torch.Tensor:
         """Returns the object to find of each lane, (n, 1) int64."""
         return self.cue[self.steering.lanes].long()[:, None]
 
-    def ways(self, pose: Pose, near: tuple) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _ways(self, pose, near) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Returns where objects are, (n, K, 2), the lengths of the shortest ways to them, (n, K)
         metres, and the landmark at which each way turns to its object, (n, K).
         """
@@ -71,26 +68,19 @@ class Oracle(SteeredBot):
         metres, landmark = (steering.lengths(near)[:, None] + last).min(-1)
         return at, metres, landmark
 
-    def walk_to(
-        self,
-        at: torch.Tensor,
-        metres: torch.Tensor,
-        landmark: torch.Tensor,
-        pose: Pose,
-        near: tuple,
-    ) -> arrdict:
-        """Returns the decision that walks to the object to find, from the result of `ways`."""
-        steering, k = self.steering, self.cued()
+    def _walk_to(self, at, metres, landmark, pose, near) -> arrdict:
+        """Returns the decision that walks to the object to find, from the result of `_ways`."""
+        steering, k = self.steering, self._cued()
         goal = at.gather(1, k[..., None].expand(-1, 1, 2))
         aim = steering.aim(pose, near, landmark.gather(1, k)[:, 0])
         is_close = steering.plans.straight(pose.plan, pose.position, goal) < REACH
         aim = torch.where(is_close, goal[:, 0], aim)
         return steering.decide(pose, aim, aim, turning=0.0)
 
-    def in_view(self, pose: Pose, at: torch.Tensor, metres: torch.Tensor) -> torch.Tensor:
+    def _in_view(self, pose, at, metres) -> torch.Tensor:
         """Returns which objects lanes see, (n, K) bool."""
         offsets = at - pose.position[:, None]
-        return self.sees(metres, offsets.norm(dim=-1), self.steering.bearings(pose, offsets))
+        return self._sees(metres, offsets.norm(dim=-1), self.steering.bearings(pose, offsets))
 
 
 class Mapper(Oracle, Explorer):
@@ -104,15 +94,13 @@ class Mapper(Oracle, Explorer):
         state = Oracle.initial(self, n_lanes, device)
         return arrdict(state, **Explorer.initial(self, n_lanes, device), known=known)
 
-    def act(
-        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
-    ) -> tuple[arrdict, arrdict]:
-        at, metres, landmark = self.ways(pose, near)
-        known = state["known"] & ~world["reset"][:, None] | self.in_view(pose, at, metres)
-        to_object = self.walk_to(at, metres, landmark, pose, near)
-        to_frontier, explored = Explorer.act(self, world, state, pose, near, generator)
-        decision = _chosen(known.gather(1, self.cued()), to_object, to_frontier)
-        return self.unstick(decision, arrdict(state, **explored, known=known), pose)
+    def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
+        at, metres, landmark = self._ways(pose, near)
+        known = state["known"] & ~world["reset"][:, None] | self._in_view(pose, at, metres)
+        to_object = self._walk_to(at, metres, landmark, pose, near)
+        to_frontier, explored = Explorer._act(self, world, state, pose, near, generator)
+        decision = _chosen(known.gather(1, self._cued()), to_object, to_frontier)
+        return self._unstuck(decision, arrdict(state, **explored, known=known), pose)
 
 
 class Wanderer(Oracle, Walker):
@@ -125,14 +113,12 @@ class Wanderer(Oracle, Walker):
         state = Oracle.initial(self, n_lanes, device)
         return arrdict(state, **SteeredBot.initial(self, n_lanes, device))
 
-    def act(
-        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
-    ) -> tuple[arrdict, arrdict]:
-        ways = self.ways(pose, near)
-        wandering, walked = Walker.act(self, world, state, pose, near, generator)
-        sees = self.in_view(pose, *ways[:2]).gather(1, self.cued())
-        decision = _chosen(sees, self.walk_to(*ways, pose, near), wandering)
-        return self.unstick(decision, arrdict(state, **walked), pose)
+    def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
+        ways = self._ways(pose, near)
+        wandering, walked = Walker._act(self, world, state, pose, near, generator)
+        sees = self._in_view(pose, *ways[:2]).gather(1, self._cued())
+        decision = _chosen(sees, self._walk_to(*ways, pose, near), wandering)
+        return self._unstuck(decision, arrdict(state, **walked), pose)
 
 
 def _chosen(condition, decision, other) -> arrdict:

@@ -104,11 +104,6 @@ class Steering:
         angles = torch.rad2deg(torch.atan2(offsets[..., 1], offsets[..., 0]))
         return (angles - pose.angle[:, None] + 180) % 360 - 180
 
-    def are_in_view(self, bearings: torch.Tensor) -> torch.Tensor:
-        """Returns whether bearings (n, k) are in the field of view of a camera."""
-        off = (bearings[..., None] - self.core.agents.yaws + 180) % 360 - 180
-        return (off.abs() < self.core.fov / 2).any(-1)
-
     def aim(self, pose: Pose, near: tuple, target: torch.Tensor) -> torch.Tensor:
         """Returns the points (n, 2) to walk straight to, on the way to targets (n,)."""
         nodes, metres = near
@@ -171,7 +166,9 @@ class Steering:
 
 
 class SteeredBot:
-    """A bot that is steered: a policy, whose subclasses have `act` and `initial`."""
+    """A bot that is steered: a policy, whose subclasses have `initial`, and `_act`, which gets the
+    poses of its lanes and the nodes near them.
+    """
 
     block = BLOCK
 
@@ -198,22 +195,15 @@ class SteeredBot:
     ) -> tuple[arrdict, arrdict]:
         """Returns (arrdict(actions (n, 1)), next state)."""
         pose = self.steering.pose()
-        return self.act(world, state, pose, self.steering.near(pose), generator)
+        return self._act(world, state, pose, self.steering.near(pose), generator)
 
-    def act(
-        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
-    ) -> tuple[arrdict, arrdict]:
-        """Returns what a call does, from its lanes' poses and the nodes near them."""
+    def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
         raise NotImplementedError
 
-    def sees(
-        self, lengths: torch.Tensor, away: torch.Tensor, bearing: torch.Tensor
-    ) -> torch.Tensor:
-        """Returns whether places are in view, (n, K) bool: the way there is straight.
-
-        Args, (n, K) each:
-            lengths, away: metres of the way there, and straight.
-            bearing: degrees.
+    def _sees(self, lengths, away, bearing) -> torch.Tensor:
+        """Returns whether places are in view, (n, K) bool, at `lengths` of the way there, `away`
+        metres straight and degrees from the heading: the way is straight.
         """
         is_straight = (lengths < BENT[0] * away + BENT[1]) & (away < SIGHT)
-        return is_straight & self.steering.are_in_view(bearing)
+        off = (bearing[..., None] - self.steering.core.agents.yaws + 180) % 360 - 180
+        return is_straight & (off.abs() < self.steering.core.fov / 2).any(-1)

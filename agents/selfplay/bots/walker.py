@@ -2,12 +2,11 @@
 plan.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 
-from megastep.agents.selfplay.bots.steering import Pose, SteeredBot, Steering
+from megastep.agents.selfplay.bots.steering import SteeredBot, Steering
 from megastep.arrdict import arrdict
 
 ARRIVED = 0.3  # metres
@@ -30,9 +29,7 @@ class Walker(SteeredBot):
         else:
             super().__init__(env)
 
-    def act(
-        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
-    ) -> tuple[arrdict, arrdict]:
+    def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
         steering, patience, target = self.steering, state["patience"] - 1, state["target"]
         if self.goal_index is not None:
             target = self.goal_index[steering.lanes].long()
@@ -60,25 +57,25 @@ class Explorer(SteeredBot):
     """
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the state of any bot, and landmarks `seen` (n, L) bool."""
+        """Returns that of any bot, and landmarks `seen` (n, L) bool."""
         n_landmarks = self.steering.plans.targets.shape[1]
         seen = torch.zeros(n_lanes, n_landmarks, dtype=torch.bool, device=device)
         return arrdict(seen=seen, **super().initial(n_lanes, device))
 
-    def act(
-        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
-    ) -> tuple[arrdict, arrdict]:
-        state = self.explore(world["reset"], state, pose, near)
+    def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
+        state = self._explore(world["reset"], state, pose, near)
         aim = self.steering.aim(pose, near, state["target"])
         return self.steering.decide(pose, aim, aim), state
 
-    def explore(self, reset: torch.Tensor, state: Mapping, pose: Pose, near: tuple) -> arrdict:
+    def _explore(self, reset, state, pose, near) -> arrdict:
         """Returns the next state, with where to go."""
         plans, lengths = self.steering.plans, self.steering.lengths(near)
         offsets = plans.targets[pose.plan] - pose.position[:, None]
         away = offsets.norm(dim=-1)
         bearing = self.steering.bearings(pose, offsets)
-        seen = (state["seen"] & ~reset[:, None]) | self.sees(lengths, away, bearing) | (away < NEAR)
+        seen = (
+            (state["seen"] & ~reset[:, None]) | self._sees(lengths, away, bearing) | (away < NEAR)
+        )
         target, patience = state["target"][:, None], state["patience"] - 1
         seen = seen.scatter(1, target, seen.gather(1, target) | (patience <= 0)[:, None])
         reached = lengths.isfinite()
