@@ -1,8 +1,10 @@
 """Compares runs in one plot, averaged over seeds, and in a table of its numbers."""
 
 import csv
+import functools
 import io
 import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -57,20 +59,20 @@ def write(
     labels = [*groups] if labels is None else labels
     if len(dict.fromkeys(labels)) != len(groups):
         raise UserError(f"labels= takes {len(groups)} different ones here, for {', '.join(groups)}")
-    table, scores = [], {}
+    table, scores, wrap = [], {}, functools.partial(textwrap.fill, width=40)  # what the axes hold
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     axes = figure.subplots()
     for name, group in zip(labels, groups.values(), strict=True):
         band = seeds.band([run.curve(metric) for run in group])
         x, mean, lower, upper = band.values()
         marker = "o" if np.ptp(x) == 0 else None
-        (line,) = axes.plot(x, mean, marker=marker, label=f"{name} ({len(group)})")
+        (line,) = axes.plot(x, mean, marker=marker, label=wrap(f"{name} ({len(group)})"))
         axes.fill_between(x, lower, upper, alpha=0.2, color=line.get_color())
         rows = zip(*(part.tolist() for part in band.values()), strict=True)
         table += [[name, *("" if math.isnan(value) else value for value in row)] for row in rows]
         scores[name] = [value for run in group if (value := run.score(metric)) is not None]
-    texts = [axes.set_xlabel(xlabel), axes.set_ylabel(ylabel or metric)]
-    texts += [axes.set_title(title)] if title else []
+    texts = [axes.set_xlabel(wrap(xlabel)), axes.set_ylabel(wrap(ylabel or metric))]
+    texts += [axes.set_title(wrap(title))] if title else []
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
     if legend != "none":
