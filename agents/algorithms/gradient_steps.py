@@ -95,9 +95,8 @@ class GradientSteps:
         self.metrics: dict[str, torch.Tensor] = {}
 
     def follow_kl(self, kl: torch.Tensor, desired: float) -> None:
-        """Changes the step size so that minibatches have about a desired KL divergence, in nats:
-        where it is above twice as much, the step size is divided by 1.5; below half, multiplied
-        (rsl_rl, Rudin et al. 2022). It stays between `ADAPTIVE_LR`.
+        """Divides the step size by 1.5 where the KL divergence is above twice a desired one, and
+        multiplies it below half (rsl_rl, Rudin et al. 2022). It stays between `ADAPTIVE_LR`.
         """
         least, most = ADAPTIVE_LR
         lower, higher = (self.lr / 1.5).clamp(min=least), (self.lr * 1.5).clamp(max=most)
@@ -131,8 +130,8 @@ class GradientSteps:
 
     @fused(_take_on_gpu, _fits)
     def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
-        """Takes one step down the gradient, and returns whether it did, () bool. Without a valid
-        transition it is not taken; if not enabled, () bool, not counted as skipped either.
+        """Takes one step down the gradient, and returns whether it did, () bool: only with valid
+        transitions, and if enabled, () bool; else it is not counted as skipped.
         """
         assert self.is_finite is not None
         grad_norm = self.optimizer.grad_norm()

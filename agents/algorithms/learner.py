@@ -62,14 +62,6 @@ OptimizerName = Annotated[
     str, AfterValidator(functools.partial(known_name, names=optimizers.NAMES))
 ]
 
-_ATTRIBUTES = {
-    "collector": "a method collector(env) that returns a collector",
-    "update": "a method update(rollout) that learns and returns scalar tensors by name",
-    "lr": "the initial learning rate",
-    "state_dict": "a method state_dict() that returns everything but the policy's weights",
-    "load_state_dict": "a method load_state_dict(state) that continues from a state_dict",
-}
-
 
 class LearnerError(AssertionError):
     """A class does not keep the contract of learners. The message names the missing attribute."""
@@ -77,9 +69,9 @@ class LearnerError(AssertionError):
 
 def check_learner(learner: object) -> None:
     """Raises LearnerError if a required attribute is missing."""
-    for name, description in _ATTRIBUTES.items():
+    for name in ("collector", "update", "lr", "state_dict", "load_state_dict"):
         if not hasattr(learner, name):
-            raise LearnerError(f"it has no {name}: {description}")
+            raise LearnerError(f"it has no {name}: see docs/learners.md, Writing a learner")
 
 
 class GradientLearner:
@@ -103,8 +95,7 @@ class GradientLearner:
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
         seed: seed of the minibatch order and of replay sampling.
 
-    A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
-    statistic.
+    A rollout with a number that is not finite, or beyond `nonfinite.LIMIT`, changes nothing.
 
     Metrics:
         loss/grad_norm: norm of the gradient before it is clipped.
@@ -215,20 +206,17 @@ class GradientLearner:
     # ---- A loss of one's own ----
 
     def extra_parameters(self) -> Iterable[torch.nn.Parameter]:
-        """Returns parameters that only `extra_loss` needs, which are none here.
-
-        Called once, before the optimizer is made, with a seed that all ranks share. They train with
-        the policy's, and are part of the learner's state: acting, exporting and `init` do without.
+        """Returns parameters that only `extra_loss` needs, which are none here. Called once, before
+        the optimizer is made, with a seed that all ranks share. They are part of the learner's
+        state, not of the policy.
         """
         return ()
 
     def extra_loss(
         self, features: torch.Tensor, batch: arrdict
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Returns a loss () that is added to the learner's, and metrics () by name.
-
-        Here it is the error of predicting privileged observations, if the critic is asymmetric, and
-        0 else.
+        """Returns a loss () that is added to the learner's, and metrics () by name. Here it is the
+        error of predicting privileged observations, if the critic is asymmetric, and 0 else.
 
         Args:
             features: (T, M, width) of the actor, from which gradients flow into it.

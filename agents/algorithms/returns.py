@@ -2,9 +2,8 @@
 
 T time, B lanes; tensors are (T, B) unless noted. Row t is the action of time t. `reward`, `reset`,
 `terminal` and `truncated` at row t come from the world that followed it, t+1. `value` at row t is
-V_t, the value of the observation *before* the action; `last_value` (B,) is V_T, the value of the
-last observation. `gamma`, `lambda_` and the clips are numbers, or tensors () on the device, which
-may change between the replays of a graph.
+V_t, of the observation *before* the action; `last_value` (B,) is V_T, of the last observation.
+`gamma`, `lambda_` and the clips are numbers, or tensors () on the device.
 
 An action is *valid* if the environment took it: valid_t = not reset_{t+1}. After a terminal step
 the value is 0; after a truncated step returns bootstrap from V. No sum crosses an episode's end.

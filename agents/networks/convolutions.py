@@ -210,14 +210,12 @@ def conv_forward(
     second_bias: torch.Tensor,
     features: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Convolves rows twice, with a ReLU after each convolution. Hidden activations and features are
-    float32 sums, rounded to bfloat16 after bias and ReLU.
+    """Convolves rows (N, C, W) for which `takes` twice, with a ReLU after each convolution, into
+    features (N, 32 W'), by channel, then by column. Hidden activations and features are float32
+    sums, rounded to bfloat16 after bias and ReLU.
 
-    Args:
-        rows: (N, C, W) for which `takes`; may be columns of a wider tensor.
-        first_weight, first_bias, second_weight, second_bias: (32, C, 8), (32,), (32, 32, 4), (32,).
-        features: (N, 32 W'), by channel, then by column: where to write, rows at multiples of 16
-            bytes. None: a new tensor.
+    Weights and biases are (32, C, 8), (32,), (32, 32, 4) and (32,). Rows may be columns of a wider
+    tensor; so may `features`, if given, at multiples of 16 bytes.
     """
     n_rows, n_channels, n_columns = rows.shape
     if features is None:

@@ -101,7 +101,6 @@ class ValueOutput(nn.Module):
     @fused(_add_on_gpu, lambda self, *_: is_plain_on_gpu(self.mean, *self.linear.parameters()))
     def add(self, moments: Moments, is_counted: torch.Tensor | None = None) -> None:
         """Adds moments of returns to the statistics, the n-th call with weight max(0.05, 1/n).
-
         Changes nothing if there is no return, if mean or variance is not finite, if all returns
         have been 0, which tells nothing about their size, or if `is_counted`, () bool, is false.
         """
@@ -186,8 +185,7 @@ class Critic(nn.Module):
     """Predicts the return: features (..., width) -> (...,) float32, in units of reward.
 
     With a `privileged_space` the critic is asymmetric (Pinto et al. 2018): it encodes the
-    privileged observation into `width` more features, and a hidden layer joins both. The actor
-    never sees them.
+    privileged observation into `width` more features, and a hidden layer joins both.
     """
 
     def __init__(self, width: int, privileged_space: Space | None = None):
@@ -320,12 +318,8 @@ def head_terms(
     mask: Tree = None,
 ) -> Terms:
     """Returns log-probabilities of actions (..., A), entropies, squared errors of the prediction
-    and values from features (..., W), (...,) float32 each.
-
-    Args:
-        prediction: predicts `encoded` from features. None: the errors are None.
-        encoded: (..., columns), of the critic's intake; None for a plain critic.
-        mask: (..., A, n) bool, allowed actions. None: all.
+    and values from features (..., W), (...,) float32 each. `encoded` (..., columns) is what the
+    critic's `encode` returned; without a prediction of it the errors are None.
     """
     errors = None
     if prediction is not None:

@@ -1,8 +1,7 @@
 """Operations with a fused form: a kernel that computes what takes PyTorch several operations.
 
-An operation is written in PyTorch first, which runs everywhere. The first kernel before it that
-takes the arguments computes it. `plain_operations` asks for PyTorch's form, for exporters and to
-tell a kernel's fault from a recipe's.
+An operation is written in PyTorch, which runs everywhere. The first kernel before it that takes the
+arguments computes it. `plain_operations` asks for PyTorch's form, such as for exporters.
 """
 
 import contextlib

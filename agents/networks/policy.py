@@ -39,8 +39,7 @@ class Policy(nn.Module):
     """Acts on worlds: `decision, state = policy(world, state)`, starting from `policy.initial(B)`.
 
     A world is the dict that an environment's `step` returns, a decision the dict that it takes.
-    Only the critic sees privileged observations, and `prediction_error` can teach the core to infer
-    them.
+    Only the critic sees privileged observations.
 
     Args:
         obs_space: the environment's observation space; or the environment, whose spaces it takes,
@@ -152,7 +151,8 @@ class Policy(nn.Module):
         generator: torch.Generator | None = None,
         **options: torch.Tensor,
     ) -> tuple[arrdict, arrdict]:
-        """Acts for one step.
+        """Acts for one step. Returns arrdict(actions, logits, logprobs (B,), features (B, width))
+        and the next hidden state.
 
         Args:
             world: has `obs`, and `reset` (B,), which clears a lane's hidden state. Actions that its
@@ -161,9 +161,6 @@ class Policy(nn.Module):
             sample: samples actions; if false, takes the most likely or best ones.
             generator: generator of the actions. Default: the policy's.
             options: further arguments of the output's `sample`, such as epsilon.
-
-        Returns:
-            arrdict(actions, logits, logprobs (B,), features (B, width)) and the next hidden state.
         """
         obs, reset = mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None]
         if sample and generator is None:
@@ -179,8 +176,8 @@ class Policy(nn.Module):
     @torch.no_grad()
     def act(self, world: arrdict, greedy: bool = False) -> arrdict:
         """Returns the decision for the world that follows the last one, whose hidden state the
-        policy carries: `world = env.step(policy.act(world))`. For several environments at once use
-        `forward`. Takes the most likely or best actions if `greedy`.
+        policy carries: `world = env.step(policy.act(world))`. Takes the most likely or best actions
+        if `greedy`.
         """
         n_lanes = len(world["reset"])
         if self._carried is None or any(len(leaf) != n_lanes for leaf in leaves(self._carried)):
@@ -318,7 +315,7 @@ class Policy(nn.Module):
     def moments(
         self, obs: Tree, privileged: Tree | None = None, is_counted: torch.Tensor | bool = True
     ) -> "list[Moments]":
-        """Returns the moments of this rank's observations, for `pool_moments` and `add_moments`."""
+        """Returns the moments of this rank's observations, see `update_stats`."""
         observations = self.intake.normalised_leaves(obs)
         if self.privileged_space:
             observations += self._critic.intake.normalised_leaves(privileged)
@@ -327,14 +324,12 @@ class Policy(nn.Module):
     def add_moments(
         self, moments: "Sequence[Moments]", is_counted: torch.Tensor | None = None
     ) -> None:
-        """Adds `moments`, pooled over the ranks, to the running statistics, unless `is_counted`, ()
-        bool, is false.
-        """
+        """Adds pooled `moments` to the statistics, unless `is_counted`, () bool, is false."""
         running_norm.add_moments(self._norms(), moments, is_counted)
 
     def clear_stats(self) -> None:
         """Makes observations and values 0 until there are statistics of them, so that learning does
-        not depend on their units. Learners call it before they collect.
+        not depend on their units.
         """
         for norm in self._norms():
             norm.clear()

@@ -89,9 +89,8 @@ def capture_with(
     """Records a function that steps an environment, with a policy or several, as a CUDA graph, by
     `capture`. `roots` are other objects with tensors that the function changes.
 
-    Returns the graph; or the function itself, with a warning, if it cannot be recorded, for example
-    because it changes attributes of a user's environment or policy that are not tensors. Such
-    attributes are restored, so results do not depend on when a graph is recorded.
+    Returns the graph; or the function itself, with a warning, if it cannot be recorded. Attributes
+    that are not tensors are restored, so results do not depend on when a graph is recorded.
     """
     state = HostState(env, policies)
     captured = capture(function, args, (env, policies, *roots), warmup, state.changed)
@@ -100,22 +99,19 @@ def capture_with(
 
 
 class Collector:
-    """Collects T steps per call into one rollout, which is overwritten and returned.
+    """Collects T steps per call into one rollout, which is overwritten and returned. Resets the
+    environment when it is made.
 
     The first call runs eagerly, so that libraries are initialised before anything is recorded.
     Later calls on a GPU replay a CUDA graph, unless the environment steps on the host.
 
-    Continues from an actor state; None resets the environment. `graph` is the CUDA graph, None
-    before the second call and without graphs.
+    Attributes:
+        graph: the CUDA graph, None before the second call and without graphs.
     """
 
-    def __init__(
-        self, env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict | None = None
-    ):
+    def __init__(self, env: Env, policy: Actor, rollout: Rollout):
         self.rollout = rollout
-        if actor_state is None:
-            actor_state = initial_actor_state(env, policy, rollout)
-        self.parts = env, policy, rollout, actor_state
+        self.parts = env, policy, rollout, initial_actor_state(env, policy, rollout)
         on_gpu = torch.device(env.device).type == "cuda"
         self.can_capture = on_gpu and optional(env, "capturable")
         self.n_collected = 0

@@ -25,9 +25,8 @@ def copy_all(
     """Copies the second tensor of each pair into the first, as `Tensor.copy_` does, unless a
     condition, () bool on the device, is false.
 
-    On a GPU, contiguous tensors of equal dtype and shape are copied by one kernel, since launches
-    take longer than copies of a few kilobytes. Copies run in any order, so a target must not share
-    memory with another tensor of the pairs.
+    On a GPU, contiguous tensors of equal dtype and shape are copied by one kernel. Copies run in
+    any order, so a target must not share memory with another tensor of the pairs.
     """
     pairs = list(pairs)  # keeps sources alive until the launch
     fused = []
