@@ -291,7 +291,8 @@ class _JointHeads(torch.autograd.Function):
 
 
 def _terms_on_gpu(output, critic, prediction, features, encoded, actions, mask=None) -> Terms:
-    sizes = _Sizes(len(prediction.weight), *output.shape, features.shape[-1])
+    n_agents, n_choices = output.shape
+    sizes = _Sizes(len(prediction.weight), n_agents, n_choices, features.shape[-1])
     inputs = features, critic.intake.projected(encoded)
     layers = prediction, output.linear, critic.hidden, critic.output.linear
     parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]

@@ -254,7 +254,7 @@ class Policy(nn.Module):
         from megastep.agents.networks.critic import prediction_error
 
         with self.compute_dtype():
-            encoded = self._critic.encode(privileged, lanes)
+            encoded = self._critic.intake.encode(privileged, lanes)
             return prediction_error(self.prediction, features, encoded)
 
     def terms(
