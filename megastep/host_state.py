@@ -13,11 +13,8 @@ __all__ = ["HostState"]
 
 class HostState(EnvState):
     """The state of an environment that is not in tensors, and that in tensors and generators on the
-    CPU where the environment is on a GPU, before a CUDA graph is recorded.
-
-    Args:
-        env: the environment.
-        policies: act in it, and may have a state of their own.
+    CPU where the environment is on a GPU, before a CUDA graph is recorded; also of the policies
+    that act in it.
     """
 
     knows_large = False

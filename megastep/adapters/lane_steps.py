@@ -79,7 +79,6 @@ class Lanes:
     step or reset.
 
     Args:
-        env: the environment.
         same_step: begin a new episode in the step that ends one, by a masked reset.
         purpose: what needs masked resets, for the message; None if nothing does.
     """
@@ -106,12 +105,9 @@ class Lanes:
     @torch.inference_mode(False)
     @torch.no_grad()
     def reset(self, seed: int | Sequence[int | None] | None = None, mask: Tree = None) -> World:
-        """Returns the first world, or with a mask the last one with new rows.
-
-        Args:
-            seed: of lane 0; the next has the next seed. Or one seed per lane. An episode depends
-                on the seed and the lane.
-            mask: (B,) bool, a tensor or an array, lanes that begin.
+        """Returns the first world, or with a mask (B,) bool of lanes that begin, the last one with
+        new rows. Lane 0 has the seed, the next the next seed; or there is one per lane. An episode
+        depends on the seed and the lane.
         """
         if seed is not None or mask is not None:
             self._require_masks("a seed or a mask")

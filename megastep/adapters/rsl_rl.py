@@ -40,11 +40,8 @@ class RslRlVecEnv(VecEnv):
     ``critic`` the observation and the privileged one, if the environment has it. A lane begins its
     next episode in the step that ends one, by a masked reset; ``extras["time_outs"]`` says where a
     time limit ended it. Actions are clipped to their bounds. An episode is truncated when its
-    length in ``episode_length_buf``, which may be written, is ``max_episode_length``.
-
-    Args:
-        env: the environment, whose resets take masks, such as Explorer or PointGoal with
-            ``control="continuous"``.
+    length in ``episode_length_buf``, which may be written, is ``max_episode_length``. Resets of the
+    environment take masks.
     """
 
     def __init__(self, env: Env):

@@ -26,11 +26,8 @@ class SB3VecEnv(VecEnv):
     observation is ``infos[lane]["terminal_observation"]``. ``env_method("action_masks")`` says
     which actions are allowed, as ``MaskablePPO`` asks. The metric ``success`` is also
     ``is_success``. An observation with the name of an attribute of `torch.nn.ModuleDict`, in which
-    SB3 keeps a network for each, gets an underscore: ``keys`` of Keys is ``keys_``.
-
-    Args:
-        env: the environment, whose resets take masks.
-        render_mode: None, or ``rgb_array``, drawings for ``VecVideoRecorder``.
+    SB3 keeps a network for each, gets an underscore: ``keys`` of Keys is ``keys_``. Resets of the
+    environment take masks. ``render_mode`` may be ``rgb_array``, for ``VecVideoRecorder``.
     """
 
     def __init__(self, env: Env, render_mode: str | None = None):

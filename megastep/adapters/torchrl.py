@@ -18,16 +18,12 @@ __all__ = ["TorchRLEnv"]
 
 
 class TorchRLEnv(EnvBase):
-    """An environment of megastep as a `torchrl.envs.EnvBase`, batch-locked: B lanes, on the
-    environment's device.
+    """An environment of megastep, whose resets take masks, as a `torchrl.envs.EnvBase`,
+    batch-locked: B lanes, on the environment's device. Floats of observations are of a dtype.
 
     Lanes begin episodes when TorchRL resets them, by a masked reset. Observations are the keys of
     the observation space, or ``observation``; ``privileged`` is one more, if there is one, and
     ``action_mask``, where the environment allows some actions only.
-
-    Args:
-        env: the environment, whose resets take masks.
-        dtype: of observations in floats.
     """
 
     def __init__(self, env: Env, dtype: torch.dtype = torch.float32):

@@ -45,12 +45,11 @@ def observation(space: Any, path: str = "observation") -> Conversion:
     if isinstance(space, gym.Discrete):
         return spaces.MultiDiscrete(1, int(space.n)), lambda x: (x - space.start)[:, None]
     if isinstance(space, gym.MultiDiscrete):
-        whole, names = _choices(space.nvec)
-        if not names:
-            return whole, lambda x: (x - space.start).reshape(-1, space.nvec.size)
-        return whole, lambda x: arrdict(
-            zip(names, np.split((x - space.start).reshape(-1, len(names)), len(names), 1))
-        )
+        if len({*space.nvec.flat}) > 1:
+            tree, convert = observation(_as_tuple(space), path)
+            return tree, lambda x: convert(x.reshape(len(x), -1).T)
+        whole = spaces.MultiDiscrete(space.nvec.size, int(space.nvec.flat[0]))
+        return whole, lambda x: (x - space.start).reshape(-1, space.nvec.size)
     if not isinstance(space, (gym.Box, gym.MultiBinary)) or 0 in space.shape:
         raise ValueError(
             f"{path} is {_described(space)}, which no encoder takes; give it a wrapper that drops "
@@ -85,13 +84,11 @@ def actions(space: Any, path: str = "action") -> Conversion:
         whole = spaces.MultiDiscrete(math.prod(space.shape), 2)
         return whole, lambda x: x.reshape(shape).astype(dtype)
     if isinstance(space, gym.MultiDiscrete):
-        whole, names = _choices(space.nvec)
-
-        def joined(tree) -> np.ndarray:
-            array = np.concatenate([tree[name] for name in names], 1) if names else tree
-            return (array.reshape(shape) + space.start).astype(dtype)
-
-        return whole, joined
+        if len({*space.nvec.flat}) > 1:
+            tree, convert = actions(_as_tuple(space), path)
+            return tree, lambda x: np.stack(convert(x), 1).reshape(shape).astype(dtype)
+        whole = spaces.MultiDiscrete(space.nvec.size, int(space.nvec.flat[0]))
+        return whole, lambda x: (x.reshape(shape) + space.start).astype(dtype)
     if not isinstance(space, gym.Box) or 0 in space.shape:
         raise ValueError(
             f"{path} is {_described(space)}, which no output chooses; give it a wrapper that "
@@ -171,13 +168,12 @@ def _parts(space, conversion, path) -> tuple[dotdict, list[tuple[str, object, Ca
     return tree, parts
 
 
-def _choices(nvec) -> tuple[Space, list[str]]:
-    """Returns the space of choices, and their names if they have different numbers of options."""
-    sizes = [int(n) for n in nvec.flat]
-    if len({*sizes}) == 1:
-        return spaces.MultiDiscrete(len(sizes), sizes[0]), []
-    names = identifiers(range(len(sizes)))
-    return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)}), names
+def _as_tuple(space) -> Any:
+    """Returns choices of different numbers of options one by one."""
+    from gymnasium.spaces import Discrete, Tuple
+
+    pairs = zip(space.nvec.flat, space.start.flat)
+    return Tuple([Discrete(int(n), start=int(start)) for n, start in pairs])
 
 
 def identifiers(keys: Iterable[object], reserved: Collection[str] = RESERVED) -> list[str]:

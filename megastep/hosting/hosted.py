@@ -38,12 +38,9 @@ class Hosted:
     A subclass has `_begin` and `_step`, which fill the rows of an environment's lanes.
 
     Args:
-        envs: the environments.
         spaces: of one lane's observation and action.
-        found: what a probe has found about them.
         check: checks the form of what they return in the first `CHECKED_STEPS`.
-        n_agents: lanes per environment, A.
-        first: number of the first in messages.
+        first: number of the first environment in messages.
     """
 
     HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
@@ -164,12 +161,8 @@ class HostedEnvs(Hosted):
     `numbers`, (N, len(found.names)) of an environment's last episode, nan where there is none.
 
     Args:
-        make: makes one environment.
-        n_envs: number of environments, N.
-        first: number of the first in messages and for its seeds.
-        found: what a probe has found.
+        first: number of the first environment in messages and for its generators.
         seed: of the global generators.
-        check: as for `Hosted`.
     """
 
     def __init__(

@@ -18,14 +18,8 @@ __all__ = ["ParallelEnvs"]
 
 
 class ParallelEnvs(Hosted):
-    """N parallel environments as one of Gymnasium's vector environments, with a row per agent.
-
-    Args:
-        make: returns a parallel environment, or a turn-based one that PettingZoo can convert.
-        n_envs: number of environments, N.
-        kwargs: arguments of ``make``.
-        check: checks the form of what the environments return in their first steps.
-        wrappers: put around each, in this order.
+    """N parallel environments of PettingZoo, with a row per agent, or turn-based ones that it can
+    convert.
 
     Attributes:
         present: (B,) bool, agents that act in the next step, also in infos. An agent is not if the

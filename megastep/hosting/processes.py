@@ -59,12 +59,12 @@ class VectorProcesses:
                 far_end.close()
                 self.pipes.append(pipe)
                 self.processes.append(process)
-        # in a worker, since a fault may end the process that it happens in
-        self.pipes[0].send(("probe", {}))
-        found = self._receive(0)
-        self.found = Probe() if isinstance(found, Exception) else found
+        self.found = Probe()
+        with contextlib.suppress(EnvError):  # which comes in training, too
+            # in a worker, since a fault may end the process that it happens in
+            (self.found,) = self._ask("probe", n_processes=1)
         (example, *_) = self._ask("begin", found=self.found)
-        self.metadata, self.render_mode, spaces = example
+        self.metadata, self.render_mode, *spaces = example
         self.single_observation_space, self.single_action_space = spaces
         self.latest_state: Tree = {}
 
@@ -84,12 +84,8 @@ class VectorProcesses:
         """Returns what the wrappers of the first environment have learnt, by path; of a process
         that has ended, what it was at the last call.
         """
-        if self.found.learnt:
-            with contextlib.suppress(OSError, EnvError, MemoryError):
-                self.pipes[0].send(("wrapper_state", {}))
-                answer = self._receive(0)
-                if not isinstance(answer, Exception):
-                    self.latest_state = answer
+        with contextlib.suppress(EnvError, MemoryError):
+            (self.latest_state,) = self._ask("wrapper_state", n_processes=1)
         return self.latest_state
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
@@ -112,15 +108,18 @@ class VectorProcesses:
         self._finalizer()
         _raise_first(answers)
 
-    def _ask(self, command, **arguments) -> list:
-        """Returns the answer of each process to a command; rows of arguments are divided."""
-        for pipe, rows in zip(self.pipes, self.rows, strict=True):
+    def _ask(self, command, n_processes=None, **arguments) -> list:
+        """Returns the answer of each process, or of the first, to a command; rows of arguments are
+        divided. Raises the first error.
+        """
+        pipes = self.pipes[:n_processes]
+        for pipe, rows in zip(pipes, self.rows):
             own = arguments
             if command in ("reset", "step"):
                 own = {name: _rows_of(batch, rows) for name, batch in arguments.items()}
             with contextlib.suppress(OSError):  # of a process that has ended, as its answer says
                 pipe.send((command, own))
-        return _raise_first([self._receive(number) for number in range(len(self.pipes))])
+        return _raise_first([self._receive(number) for number in range(len(pipes))])
 
     def _receive(self, number) -> Any:
         """Returns the answer of a process, which may be an error of an environment. Raises
@@ -156,8 +155,8 @@ def _serve(pipe, make, rows, seed, check) -> None:
         if command == "begin":
             n_envs = rows.stop - rows.start
             envs = HostedEnvs(make, n_envs, rows.start, seed=seed, check=check, **arguments)
-            spaces = envs.single_observation_space, envs.single_action_space
-            return envs.metadata, envs.render_mode, spaces
+            names = "metadata", "render_mode", "single_observation_space", "single_action_space"
+            return [getattr(envs, name) for name in names]
         return getattr(envs, command)(**arguments)
 
     command = None
@@ -180,8 +179,10 @@ def _attempt(function, *arguments) -> Any:
     """Returns what a function returns, or its error, in a form that can be sent."""
     try:
         return function(*arguments)
-    except (EnvError, MemoryError) as error:
-        return error if isinstance(error, EnvError) else MemoryError(*map(str, error.args))
+    except EnvError as error:
+        return error
+    except MemoryError as error:
+        return MemoryError(*map(str, error.args))
     except Exception as error:
         return EnvError.of(error, "an environment")
 

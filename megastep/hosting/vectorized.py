@@ -37,12 +37,9 @@ class VectorizedEnv:
 
     Args:
         id: name of the environments in messages.
-        vector: environments with a row per lane, in this process or others:
-            :class:`~megastep.hosting.hosted.HostedEnvs`, or ones with the same methods.
-        n_envs: number of environments, N.
-        n_agents: lanes per environment, A.
+        vector: environments with a row per lane: :class:`~megastep.hosting.hosted.HostedEnvs`, or
+            ones with the same methods.
         seed: from which each environment's seed at its first reset derives.
-        device: where worlds and actions are. Default: a GPU if there is one.
         check: refuses actions that are not finite, and in the first `CHECKED_STEPS` observations
             that are not in their space; warns of those beyond the bounds of a Box.
     """
