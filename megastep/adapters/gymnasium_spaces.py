@@ -17,7 +17,7 @@ NUMPY: Any = {torch.float16: np.float16, torch.float32: np.float32}
 
 
 def gymnasium_space(space: Space, dtype: torch.dtype) -> gymnasium.Space:
-    """Returns Gymnasium's space of one lane's actions, or observations with this dtype of floats."""
+    """Returns Gymnasium's space of one lane's actions, or observations with floats of a dtype."""
     if isinstance(space, Mapping):
         parts = {key: gymnasium_space(part, dtype) for key, part in space.items()}
         return gymnasium.spaces.Dict(parts)

@@ -70,11 +70,10 @@ class Hosted:
         self.infos: dict[str, Any] = {"action_mask": self.masks}
         self.frozen: Tree = None  # a state of the wrappers that does not change
 
-    def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
-        """Resets every environment. Returns (observations, infos)."""
+    def reset(self, *, seed: Sequence[int] | None = None) -> tuple:
+        """Resets every environment. Returns what a step returns."""
         self.ended[:] = True
-        obs, *_, infos = self._advance(itertools.repeat(()), seed)
-        return obs, infos
+        return self._advance(itertools.repeat(()), seed)
 
     def step(self, actions: Tree) -> tuple:
         """Takes one step. Returns (observations, rewards, terminated, truncated, infos). Infos have

@@ -68,7 +68,7 @@ class VectorProcesses:
         self.single_observation_space, self.single_action_space = spaces
         self.latest_state: Tree = {}
 
-    def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
+    def reset(self, *, seed: Sequence[int] | None = None) -> tuple:
         return _joined(self._ask("reset", seed=seed))
 
     def step(self, actions: Tree) -> tuple:

@@ -80,7 +80,7 @@ class VectorizedEnv:
             )
         if found.n_masked < 0:
             must = "it must be a number per action of a Discrete space"
-            problems.append(f"info['action_mask'] is not used: {must}")
+            problems += [f"info['action_mask'] is not used: {must}"]
         for problem in problems:
             warnings.warn(f"{id}: {problem}", stacklevel=3)
         self._metrics = identifiers(found.names[:MAX_NUMBERS], {*RESERVED_KEYS, *RESERVED})
@@ -89,10 +89,9 @@ class VectorizedEnv:
 
     def reset(self) -> arrdict:
         """Starts a new episode in every lane. Returns the first world. Raises EnvError."""
-        obs, infos = self._call(self.vector.reset, seed=self._seeds)
-        self._seeds = None
+        seeds, self._seeds = self._seeds, None
         self._ended[:] = True
-        return self._world(obs, np.zeros(len(self._ended)), self._ended, self._ended, infos)
+        return self._world(*self._call(self.vector.reset, seed=seeds))
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``. Returns a world. Raises EnvError."""
@@ -177,13 +176,10 @@ class VectorizedEnv:
 
     def _world(self, obs, reward, terminated, truncated, infos) -> arrdict:
         """Returns the world after a step, in which lanes that had ended before it began again."""
-        reset = self._ended.copy()
-        terminal = terminated > reset
-        truncated = truncated > (reset | terminal)
         if self._n_to_check > 0:
             self._check_observations(obs)
-        present = infos.get("present")
-        self._ended[:] = terminal | truncated if present is None else ~present
+        reset, present = self._ended.copy(), infos.get("present")
+        self._ended[:] = terminated | truncated if present is None else ~present
 
         def copied(space, values) -> np.ndarray:
             dtype = DTYPES.get(getattr(space, "dtype", None), np.int64)
@@ -191,10 +187,10 @@ class VectorizedEnv:
 
         world = dict(
             obs=spaces.map(copied, self.obs_space, self._read(obs)),
-            reward=np.where(reset, 0.0, reward).astype(np.float32),
+            reward=reward.astype(np.float32),
             reset=reset,
-            terminal=terminal,
-            truncated=truncated,
+            terminal=terminated.copy(),
+            truncated=truncated & ~terminated,
         )
         if present is not None:
             world["learns"] = present.copy()
@@ -216,9 +212,8 @@ def one_sentence(id: str | None, kwargs: dict | None) -> Iterator[None]:
         yield
     except Exception as error:
         line = str(error) if isinstance(error, ValueError) else one_line(error)
-        line = (
-            line.strip().partition("\n")[0].partition(" was raised from the environment creator")[0]
-        )
+        line, *_ = line.strip().partition("\n")
+        line, *_ = line.partition(" was raised from the environment creator")
         cause = f" with env.kwargs={kwargs}" if kwargs else ""
         raise ValueError(f"{id} cannot be made{cause}: {line}") from error
 
