@@ -281,9 +281,6 @@ class Captured:
     """Wraps an environment on a GPU so that ``step`` replays a CUDA graph, recorded at the first
     step. On the CPU, and if the environment is not ``capturable``, ``step`` is its own. All other
     attributes are the environment's.
-
-    Args:
-        env: the environment to wrap.
     """
 
     capturable = False  # a graph cannot be replayed in another one's recording

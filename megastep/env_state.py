@@ -49,12 +49,8 @@ class EnvState:
     Tensors of a MB and more that have not changed since, such as floor plans, are left out: a new
     environment of the same settings has them.
 
-    It reaches what attributes, lists and dicts lead to; `unreachable` names the rest. Make it after
-    ``env.reset()``.
-
-    Args:
-        env: the environment.
-        bot: a policy that plays in it and may have a state of its own, or None.
+    It reaches what attributes, lists and dicts lead to, also of a bot that plays in it;
+    `unreachable` names the rest. Make it after ``env.reset()``.
     """
 
     knows_large = True

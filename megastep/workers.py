@@ -8,10 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from loky import ProcessPoolExecutor
+from concurrent.futures import Executor
 
 __all__ = ["WORKER_ENV", "end_with_parent", "pool", "terminal_signals_blocked"]
 
@@ -58,7 +55,7 @@ def end_with_parent(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def pool(n_workers: int) -> "ProcessPoolExecutor":
+def pool(n_workers: int) -> Executor:
     """Returns a pool of processes with :data:`WORKER_ENV`, which end with this one. Its first
     workers start with the first call, which belongs inside :func:`terminal_signals_blocked`.
     """

@@ -25,10 +25,8 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
     the episode's metrics. Where the environment allows some actions only, each ``info`` has them as
     ``action_mask``, int8. Play Deathmatch in rounds, ``resample=True``: otherwise it never ends.
 
-    Args:
-        env: the environment, of one environment. Agents have the names of its ``roles``, or
-            ``agent_0``, ``agent_1``, ...
-        render_mode: None or ``rgb_array``.
+    Agents have the names of ``env.roles``, or ``agent_0``, ``agent_1``, ... ``render_mode`` is None
+    or ``rgb_array``.
     """
 
     def __init__(self, env: Env, render_mode: str | None = None):

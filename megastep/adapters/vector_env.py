@@ -192,11 +192,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
 
 class SingleEnv(gymnasium.Env):
-    """An environment of megastep with one lane as a `gymnasium.Env`, in NumPy.
-
-    Args:
-        env: the environment, of one lane.
-        render_mode: None or ``rgb_array``.
+    """An environment of megastep with one lane as a `gymnasium.Env`, in NumPy. ``render_mode`` is
+    None or ``rgb_array``.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}

@@ -101,12 +101,8 @@ class Wrapper:
 
 
 class Draws:
-    """Uniform numbers in [0, 1), equal on CPU and GPU.
-
-    Args:
-        env: their number of lanes, B, and device.
-        shape: of the numbers of a lane.
-        seed: from 0 to 2**64 - 1.
+    """Uniform numbers in [0, 1), equal on CPU and GPU, of a shape for each lane of an environment.
+    A seed is from 0 to 2**64 - 1.
     """
 
     def __init__(self, env: Env, shape: tuple[int, ...], seed: int):

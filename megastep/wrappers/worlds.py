@@ -50,7 +50,6 @@ class FrameStack(Wrapper):
     oldest first. At the start of an episode all are the first observation.
 
     Args:
-        env: the environment inside.
         n: number of observations.
         sensors: dotted paths of those to stack. Default: all images and vectors.
     """
@@ -99,7 +98,6 @@ class DropSensor(Wrapper):
     """Sets a sensor's values to 0 with a probability, as if it failed.
 
     Args:
-        env: the environment inside.
         sensor: its dotted path in observations, such as `rgb`.
         probability: in each step, per lane.
         seed: of the draws.
@@ -124,7 +122,6 @@ class NoisySensor(Wrapper):
     """Adds nearly Gaussian noise to a sensor's values.
 
     Args:
-        env: the environment inside.
         sensor: its dotted path in observations, such as `d`.
         std: standard deviation, in the units of the observation.
         seed: of the draws.
@@ -160,7 +157,6 @@ class ScaleReward(Wrapper):
     """Multiplies rewards by a factor.
 
     Args:
-        env: the environment inside.
         factor: a number or a schedule.
     """
 
@@ -181,7 +177,6 @@ class ClipReward(Wrapper):
     """Clips rewards.
 
     Args:
-        env: the environment inside.
         min: smallest reward, at most 0: the first reward of an episode is 0.
         max: largest reward, at least 0.
     """
@@ -202,7 +197,6 @@ class ShapeReward(Wrapper):
     """Replaces rewards by those of a function.
 
     Args:
-        env: the environment inside.
         function: import path of a function of a world, `module:function`, or the function. It
             returns the new rewards, (B,) float32, and does not change the world.
     """
