@@ -135,18 +135,9 @@ class Area(Artist):
         self.add(lambda r: self.draw_path(r, path, self.transform, None, colour, width, alpha), z)
 
     def draw_path(
-        self,
-        renderer,
-        path,
-        transform,
-        fill=None,
-        edge=None,
-        width=0.0,
-        alpha=1.0,
-        hatch=None,
-        clip=True,
+        self, renderer, path, at, fill=None, edge=None, width=0.0, alpha=1.0, hatch=None, clip=True
     ) -> None:
-        """Draws a matplotlib path at once."""
+        """Draws a matplotlib path at once, ``at`` a transform."""
         gc = renderer.new_gc()
         gc.set_linewidth(renderer.points_to_pixels(width) if edge is not None else 0)
         gc.set_foreground(to_rgba(edge if edge is not None else "k", alpha), isRGBA=True)
@@ -157,7 +148,7 @@ class Area(Artist):
             gc.set_hatch("//")
             gc.set_hatch_color(to_rgba(hatch))
             gc.set_hatch_linewidth(1.0)
-        renderer.draw_path(gc, path, transform, None if fill is None else to_rgba(fill, alpha))
+        renderer.draw_path(gc, path, at, None if fill is None else to_rgba(fill, alpha))
         gc.restore()
 
     def disc(
@@ -266,10 +257,7 @@ def _word(word, size, bold, colour, dpi) -> tuple[np.ndarray, float, int]:
 
 
 def panels(
-    n_strips: int = 0,
-    title: str | None = None,
-    n_cameras: int = 1,
-    columns: int = 1,
+    n_strips: int = 0, title: str | None = None, n_cameras: int = 1, columns: int = 1
 ) -> tuple[Picture, Area, list[Area]]:
     """Makes a picture with a floor plan, a line of numbers above it, and strips for images below:
     640 pixels wide and 720 high (at a :attr:`Style.dpi` of 100), or higher for many strips.
