@@ -18,7 +18,7 @@ PATIENCE, TURNS = 20, 3  # steps at a place after which a lane turns, and for ho
 
 
 class Oracle(SteeredBot):
-    """Knows the maze and where the object of a Memory to find is: near the most that can be found."""
+    """Knows the maze and where the object to find is. A trained agent beats it in some mazes."""
 
     block = 2  # squares of 0.3 m per side of a landmark's block: a maze's cell has a landmark
 
