@@ -95,9 +95,9 @@ class Ranks(NamedTuple):
         for name, sums in zip(tensors, rows, strict=True):
             if different := [rank for rank, value in enumerate(sums) if value != sums[0]]:
                 raise DriftError(
-                    f"The ranks drift apart: policy.{name} differs on {ranks_named(different)}; a "
-                    "learner averages gradients with "
-                    "megastep.agents.distributed.pooling.average_gradients"
+                    f"The ranks drift apart: policy.{name} differs on {ranks_named(different)}; "
+                    "start all with the same options and packages; a learner of your own averages "
+                    "gradients with megastep.agents.distributed.pooling.average_gradients"
                 )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import platform
 import secrets
 import shutil
 import time
@@ -13,17 +12,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import torch
-
 from megastep import engine
-from megastep.agents import console, factory, package
+from megastep.agents import console, factory
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.process_group import from_rank_0, together
-from megastep.agents.distributed.ranks import DriftError, ranks_named
+from megastep.agents.distributed.ranks import DriftError
 from megastep.agents.errors import EnvFailed, UserError, memory_problem, user_errors
-from megastep.agents.factory import check, env_failures, settings
+from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, signals
 from megastep.agents.runs import folders, provenance
@@ -73,7 +69,6 @@ class Run:
                 console.say(f"The run in {start.folder} has already {start.ended}.")
                 return start.folder
             self.cfg = start.cfg
-        check_start(self.cfg)
         with contextlib.ExitStack() as locks:
             self.start(locks)
             # of a signal to all ranks, the first to get it stops them, and others get it later
@@ -246,42 +241,6 @@ def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:
     folder = trainer.saver.folder.parent
     folders.write_config(folder, trainer.saver.config["train"])
     provenance.record(folder, trainer.samples, device, hosts)
-
-
-# ---- What ranks check before training ----
-
-
-def check_start(cfg: settings.Train) -> None:
-    """Raises UserError if the ranks differ in versions, code or settings."""
-    if process_group.n_ranks() == 1:
-        return
-    facts = {
-        "torch": torch.__version__,
-        "CUDA": torch.version.cuda,
-        "NumPy": np.__version__,
-        "Python": platform.python_version(),
-        "megastep": package.version(),
-        "the commit of the checkout": provenance.commit(package.ROOT),
-    }
-    check_equal(facts | dict(check.leaves(check.as_tree(cfg))))
-
-
-def check_equal(facts: dict[str, object]) -> None:
-    """Compares facts of all ranks by name, the most important first. Raises UserError with the
-    first that differs, such as `learner.lr is 0.001 on rank 0, and 0.01 on ranks 1 and 3`.
-    """
-    everyones = process_group.gather_objects({name: str(value) for name, value in facts.items()})
-    for name in dict.fromkeys(name for theirs in everyones for name in theirs):
-        of_ranks = [theirs.get(name, "missing") for theirs in everyones]
-        if len({*of_ranks}) > 1:
-            values = (
-                f"{value} on {ranks_named([n for n, one in enumerate(of_ranks) if one == value])}"
-                for value in dict.fromkeys(of_ranks)
-            )
-            raise UserError(
-                f"The ranks differ: {name} is {', and '.join(values)}; start all with the same "
-                "code, packages and options"
-            )
 
 
 def check_shared(folder: Path) -> str:
