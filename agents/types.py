@@ -88,10 +88,6 @@ class CollectorOptions(Protocol):
     allocate_layouts: Callable[[], None] | None = None
 
     @staticmethod
-    def wait() -> None:
-        """Blocks until nothing acts in the environment, for a collector in the background."""
-
-    @staticmethod
     def state_dict() -> StateDict:
         """Returns all that it carries from rollout to rollout. Empty: resumed runs begin anew."""
         return {}

@@ -210,8 +210,6 @@ class Population:
             each(lambda i: trainers[i].finish())
         finally:
             for one in trainers:
-                with contextlib.suppress(Exception):  # the first error is the one to report
-                    one.wait_for_collector()
                 one.saver.wait()
             if self.lines is not None:
                 self.lines.close()
@@ -294,7 +292,6 @@ class Population:
         if learnt is None:
             return
         trainer = self._trainer(target)
-        trainer.wait_for_collector()
         copy_from = with_defaults(trainer.learner, LearnerOptions).copy_from
         assert copy_from is not None
         copy_from(learnt.learner)
@@ -310,7 +307,6 @@ class Population:
         learnt = state = None
         if source in self.members:
             trainer = self._trainer(source)
-            trainer.wait_for_collector()
             wrappers = optional(trainer.env, "wrapper_state")()
             learnt = AgentParts(trainer.policy, trainer.learner, wrappers)
         if source % self.n_ranks == target % self.n_ranks:

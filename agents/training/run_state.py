@@ -34,11 +34,10 @@ class RunState:
         self.has_named_unreachable = False
 
     def state_dict(self, has_episodes: bool = True) -> StateDict:
-        """Returns the state as dicts of tensors, most of them no copies, and plain values, once no
-        collector steps; with episodes, that is the environment and the actor state.
+        """Returns the state as dicts of tensors, most of them no copies, and plain values; with
+        episodes, that is the environment and the actor state.
         """
         trainer = self.trainer
-        trainer.wait_for_collector()
         parts = dict(
             samples=trainer.samples,
             updates=trainer.updates,

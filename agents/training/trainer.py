@@ -15,7 +15,7 @@ from megastep.agents.training.episode_stats import Episodes
 from megastep.agents.training.performance import Timing
 from megastep.agents.training.run_state import RunState
 from megastep.agents.training.tuning import Tuning
-from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
+from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
@@ -131,8 +131,6 @@ class Trainer:
                 self._rescue(error)
             raise
         finally:
-            with contextlib.suppress(Exception):  # as above
-                self.wait_for_collector()
             self.saver.wait()
 
     def _rescue(self, error) -> None:
@@ -187,7 +185,6 @@ class Trainer:
             anneal: what the learning rate falls with.
             schedule/NAME: a setting of the learner or the environment that has a schedule.
         """
-        self.wait_for_collector()
         optional(self.env, "check")()
         self.ranks.check_drift(self.policy, self.learner_options.extra)
         if self.updates % self.log_every == 0:
@@ -233,7 +230,3 @@ class Trainer:
     def close(self) -> None:
         """Closes the environment and the callbacks."""
         self.callbacks.close(self.env)
-
-    def wait_for_collector(self) -> None:
-        """Waits until an async collector has stopped stepping the environment."""
-        with_defaults(self.collect, CollectorOptions).wait()

@@ -29,7 +29,6 @@ class Tuning:
         self.scheduled: dict[str, float] = {}
         of_learner, of_env = self.options.coefficients, [*optional(trainer.env, "coefficients")]
         self.coefficients = of_env if of_learner is None else [*of_env, of_learner]
-        self.has_env_schedules = any(one.schedules for one in of_env)
         anneal = trainer.budget.anneal
         if anneal != "never" and not self.options.set_lr:
             raise ValueError(
@@ -54,7 +53,6 @@ class Tuning:
         Raises:
             ValueError: a setting cannot change while training.
         """
-        self.trainer.wait_for_collector()
         for key, value in values.items():
             self._owner(key).set(**{key.partition(".")[2]: value})
             if key == "learner.lr":
@@ -76,8 +74,6 @@ class Tuning:
         """Sets what has a schedule. Raises UserError if a schedule of the user's fails."""
         while self.timetable and self.timetable[0][0] <= trainer.samples:
             self.set(self.timetable.pop(0)[1])
-        if self.has_env_schedules:
-            trainer.wait_for_collector()  # which reads them
         for one in self.coefficients:
             if one.schedules:
                 with user_errors("", (ValueError,)):

@@ -275,30 +275,6 @@ def test_metrics_are_logged_by_name_and_role_for_lanes_that_learn(tmp_path):
     assert run.latest_stats["episode/age"] == 75
 
 
-def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
-    run, order = make_trainer(tmp_path, samples=3 * UPDATE, every=2), []
-    collect = run.collect
-
-    class AsyncCollector:
-        rollout = collect.rollout
-
-        def __call__(self):
-            order.append("collect")
-            return collect()
-
-        def wait(self):
-            order.append("wait")
-
-        def state_dict(self):
-            return collect.state_dict()
-
-    run.collect = AsyncCollector()
-    run.env.check = lambda: order.append("check")
-    run.train()
-    reported = ["wait", "check"]
-    assert order == ["collect", "collect", *reported, "collect", "wait", *reported, "wait"]
-
-
 def test_trainer_stops_on_request(tmp_path):
     run = make_trainer(tmp_path, every=5)
     run.train(lambda: run.updates == 2)
