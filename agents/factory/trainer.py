@@ -18,7 +18,6 @@ from megastep.agents.factory import check, conflicts, settings
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.runs import (
     agent_file,
-    annealing,
     checkpoint,
     folders,
     populations,
@@ -100,7 +99,7 @@ def make_trainer(
         saves = Saver(folder / "checkpoints", config, cfg.checkpoints.keep, made_with, *of_ranks)
         limits = budget_of(cfg, folder, resumed)
         if number == 0:  # which alone writes these
-            observers.append(annealing.AnnealingRecord(folder, had["updates"]))
+            observers.append(budget.AnnealingRecord(folder, had["updates"]))
             observers += [make_loggers(cfg, folder, had["samples_at_report"]), *callbacks]
             if cfg.checkpoints.snapshots:
                 shots = Saver(folder / "snapshots", config, keep_checkpoints=10**9)
@@ -186,10 +185,10 @@ def budget_of(
     recorded = ()
     if cfg.rerun:
         source = folders.folder_of(folders.find(cfg.rerun))
-        if not (recorded := annealing.read(source)):
-            raise UserError(f"{source} cannot be repeated: it has no {annealing.FILE}")
+        if not (recorded := budget.read_record(source)):
+            raise UserError(f"{source} cannot be repeated: it has no {budget.RECORD}")
     elif loaded is not None:
-        recorded = annealing.read(folder)
+        recorded = budget.read_record(folder)
         # a clock of another budget would have chosen others
         if cfg.learner.anneal != "seconds" or loaded.config["train"]["seconds"] != cfg.seconds:
             assert loaded.state is not None

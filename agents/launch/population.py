@@ -50,6 +50,7 @@ class PopulationRun(Run):
         if (n := self.n_ranks) > (size := cfg.population.size):
             text = f"{n} is more than the {size} members of the population"
             raise ConfigErrors([("ranks", f"{text}; use population.size={n} or more")])
+        self.title = f"Training {size} members"
 
     def open(self, locks: contextlib.ExitStack) -> tuple[Path, Any]:
         if self.cfg.resume is None:
@@ -110,9 +111,6 @@ class PopulationRun(Run):
             *(self.trainers, self.streams, self.folder, cfg.seed, chosen),
             *(cfg.checkpoints.seconds, visitor, repeated),
         )
-
-    def title(self) -> str:
-        return f"Training {self.cfg.population.size} members"
 
     @contextlib.contextmanager
     def around(self) -> Iterator[None]:

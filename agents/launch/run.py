@@ -45,7 +45,7 @@ class Run:
         trainers: those of this rank.
     """
 
-    of_each = ""  # agent, in messages about samples
+    title, of_each = "Training", ""  # of messages
     folder: Path
     training: Any
     trainers: Sequence[Trainer]
@@ -103,7 +103,7 @@ class Run:
             if self.is_first:
                 folders.record_start(self.folder)
                 where = f"{self.n_ranks} x {self.device.type}" if self.n_ranks > 1 else self.device
-                console.say(f"{self.title()} on {where} in {self.folder}")
+                console.say(f"{self.title} on {where} in {self.folder}")
             undo.pop_all()
 
     def open(self, locks: contextlib.ExitStack) -> tuple[Path, Any]:
@@ -136,9 +136,6 @@ class Run:
         from_rank_0(lambda: record(self.training, self.device, hosts))
         if clauses := dict.fromkeys(itertools.chain(*lost)):
             console.say(f"Resuming, but not bit for bit: {'; '.join(clauses)}.")
-
-    def title(self) -> str:
-        return "Training"
 
     # ---- Training ----
 

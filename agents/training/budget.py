@@ -7,7 +7,16 @@ import contextlib
 import dataclasses
 import math
 import time
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from megastep.atomic_files import AppendedFile
+
+#: The learning rate's factor (1 at first) in each update of a run, as one float64. With `seconds=`
+#: factors depend on the clock; by this file `rerun` repeats such a run.
+RECORD = "annealing.f64"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +58,7 @@ class Budget:
         """Returns the fraction of the budget that is left for the next update, from 1 to 0: the
         factor of the learning rate if it is annealed, and what schedules follow. Else 1.
         """
-        if updates < len(self.recorded) and not math.isnan(self.recorded[updates]):
+        if updates < len(self.recorded):
             return self.recorded[updates]
         if self.anneal == "never" and not self.is_scheduled:
             return 1.0
@@ -104,3 +113,47 @@ class Stopwatch:
         """Seconds of training so far, those before a resume included."""
         since_start = 0.0 if self.started is None else time.monotonic() - self.started
         return self.seconds_before + since_start
+
+
+def read_record(folder: Path | str) -> array:
+    """Returns the factor of each update of a run; empty without a record. Raises ValueError if one
+    is not from 0 to 1.
+    """
+    factors, path = array("d"), Path(folder) / RECORD
+    if path.exists():
+        data = path.read_bytes()
+        factors.frombytes(data[: len(data) // factors.itemsize * factors.itemsize])
+    if not all(0 <= factor <= 1 for factor in factors):
+        raise ValueError(f"{path} is damaged: factors of the learning rate are from 0 to 1")
+    return factors
+
+
+class AnnealingRecord:
+    """A callback that appends to a run's record, whose factors after `n_updates` are removed. What
+    a full disk refuses is written later.
+    """
+
+    def __init__(self, folder: Path | str, n_updates: int = 0):
+        n_bytes = min(n_updates, len(read_record(folder))) * array("d").itemsize
+        self.file = AppendedFile(Path(folder) / RECORD, n_bytes)
+
+    def on_rollout(self, trainer: Any, rollout: object) -> None:
+        """Appends the factor of the update that a trainer begins, in memory."""
+        self.file.unwritten += array("d", [trainer.lr_fraction]).tobytes()
+
+    def on_report(self, trainer: object, metrics: object) -> None:
+        """Writes the appended factors."""
+        with contextlib.suppress(OSError):
+            self.file.flush()
+
+    def may_save(self, trainer: object) -> bool:
+        """Flushes the factors to disk, which a checkpoint must not reach beyond."""
+        with contextlib.suppress(OSError):
+            self.file.sync()
+            return True
+        return False
+
+    def close(self) -> None:
+        """Writes the appended factors and closes the file."""
+        with contextlib.suppress(OSError):
+            self.file.close()

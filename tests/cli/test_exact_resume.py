@@ -10,8 +10,9 @@ import torch
 
 from megastep import spaces
 from megastep.agents.cli import entry, train
-from megastep.agents.runs import annealing, checkpoint
+from megastep.agents.runs import checkpoint
 from megastep.agents.storage.collector import Collector
+from megastep.agents.training import budget
 from megastep.arrdict import arrdict
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, forked
@@ -311,11 +312,11 @@ def test_rerun(here, capsys):
     words = ["seconds=0.8", "checkpoints.seconds=0.05", "checkpoints.keep=99"]
     run(*tiny.TINY, *words, "logging.every=2", "folder=run")
     *reports, _ = (here / "run/metrics.jsonl").read_bytes().splitlines()
-    factors = annealing.read("run")
+    factors = budget.read_record("run")
     killed_after = checkpoint.list_checkpoints("run/checkpoints")[0]
     run(f"resume={killed_after}")
     assert (here / "run/metrics.jsonl").read_bytes().splitlines()[: len(reports)] == reports
-    assert annealing.read("run")[: len(factors)] == factors
+    assert budget.read_record("run")[: len(factors)] == factors
     capsys.readouterr()
     run("rerun=run", "folder=again")
     assert "metrics.jsonl equals that of run, byte for byte" in capsys.readouterr().out

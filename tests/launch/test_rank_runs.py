@@ -12,7 +12,8 @@ import torch
 from megastep.agents.cli import train
 from megastep.agents.distributed import process_group
 from megastep.agents.launch import run as launch_run
-from megastep.agents.runs import annealing, checkpoint, json_lines
+from megastep.agents.runs import checkpoint, json_lines
+from megastep.agents.training import budget
 from tests.cli.test_exact_resume import CASES, EVERY_UPDATE, differences
 from tests.helpers import ranks, tiny
 
@@ -110,7 +111,7 @@ def test_rank_0_writes_and_speaks(alone, here):
     assert re.search("trained .* 9 ", first.stdout)
     samples = [row["samples"] for row in json_lines.read("alone/metrics.jsonl")]
     assert samples == [*range(128, 1281, 128)]  # of both ranks
-    assert len(annealing.read("alone")) == 20
+    assert len(budget.read_record("alone")) == 20
     (row,) = json_lines.read("alone/provenance.jsonl")
     assert row["ranks"] == 2 and row["hosts"]
     assert len(checkpoint.list_checkpoints("alone/snapshots")) == 2

@@ -16,10 +16,9 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import checkpoint
-from megastep.agents.runs.annealing import AnnealingRecord
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training import performance
-from megastep.agents.training.budget import Budget
+from megastep.agents.training.budget import AnnealingRecord, Budget
 from megastep.agents.training.callbacks import MAX_SKIPPED, Evaluations
 from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.performance import MAX_AHEAD
