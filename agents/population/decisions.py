@@ -46,12 +46,10 @@ def decide(
     from the first, with settings near theirs.
 
     Args:
-        seed: the population's.
         generation: 1 for the first.
         scores: of each member; higher is better. None: unknown, so it neither copies nor is copied.
             Minus infinity: it has diverged, so it copies another, and is never copied.
-        settings: of each member.
-        vary: what the settings may be.
+        settings: of each member, which `vary` says may be others.
     """
     known = [n for n, score in enumerate(scores) if score is not None]
     ranked = sorted(known, key=lambda n: (-_score(scores[n]), n))

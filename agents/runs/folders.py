@@ -64,10 +64,8 @@ def new(name: str, folder: str | None = None, is_again: bool = False) -> Path:
 
 
 def check_free(name: str | None, is_again: bool = False) -> None:
-    """Raises UserError if the folder of a new run is not empty or cannot be read.
-
-    Args:
-        is_again: also allows the folder of a run that ended before it saved anything.
+    """Raises UserError if the folder of a new run is not empty or cannot be read. `is_again` also
+    allows that of a run that ended before it saved anything.
     """
     folder = Path(name or "")
     with user_errors(CANNOT.format(shortened(folder))):

@@ -118,9 +118,6 @@ class NonFiniteGuard:
     the learner skips those with one, see `nonfinite.NonFiniteCheck`. All ranks call it at the same
     updates; they exchange what they found.
 
-    Args:
-        learner: its `check` is read, if it has one.
-
     Attributes:
         value: the first NaN or infinity of the run, or None.
         tolerates_divergence: a policy that diverged is noted in `has_diverged`, and raises nothing,

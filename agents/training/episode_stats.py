@@ -152,12 +152,10 @@ class EpisodeStats:
     ) -> dict[str, float]:
         """Returns statistics for a report, and begins an interval. Synchronises.
 
-        Args:
-            sum_over_ranks: adds the numbers of the other ranks, where there are any.
-
         Means are over the episodes of the intervals between reports whose episodes have all ended
         since the last call, in the order of the intervals, and if these are fewer than
         `MIN_EPISODES`, those of earlier calls, a call at a time. They are absent if there are none.
+        `sum_over_ranks` adds the numbers of the other ranks.
 
         Metrics:
             episode/count: episodes that no earlier report has counted.
@@ -244,11 +242,7 @@ class EpisodeStats:
 
 def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
     """Returns groups of an environment's lanes by name, (B,) bool: one per role, and one per kind
-    of opponent.
-
-    Args:
-        env: may have `roles`, of each agent slot, and `matchups`, of `selfplay.opponents`.
-        stored: (all lanes,) bool, the lanes to keep in each group, such as those that learn.
+    of opponent; of the `stored` lanes alone, (all lanes,) bool, such as those that learn.
     """
     groups, roles = {}, optional(env, "roles") or ()
     for role in dict.fromkeys(roles):
@@ -289,13 +283,9 @@ class Episodes:
     def begin(
         self, trainer: Trainer, sources: Sequence[str] | None = None, desync: bool = False
     ) -> None:
-        """Begins to count, before the first update.
-
-        Args:
-            sources: the name of the source of each layout of the environment, whose episodes have
-                statistics of their own.
-            desync: starts the first episodes at random ages, if the environment has a method
-                `desync()`, and leaves them out.
+        """Begins to count, before the first update, with statistics for the source of each layout.
+        `desync` starts the first episodes at random ages, if the environment can, and leaves them
+        out.
         """
         env, rollout = trainer.env, trainer.rollout
         allocate_layouts = getattr(trainer.collect, "allocate_layouts", None)

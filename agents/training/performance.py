@@ -26,9 +26,6 @@ class Timing:
     current stream, by CUDA events. Work on other streams counts only where that stream waits for
     it.
 
-    Args:
-        device: where the training is done.
-
     Attributes:
         times_phases: false for a member of a population but the first, as members share the device.
         rate: samples per second between the last two reports, or None.

@@ -16,10 +16,8 @@ if TYPE_CHECKING:
 
 
 class RunState:
-    """The state of a run: what trains, and the trainer's counters.
-
-    Args:
-        trainer: whose collector has reset the environment.
+    """The state of a run: what trains, and the counters of the trainer, whose collector has reset
+    the environment.
     """
 
     def __init__(self, trainer: Trainer):

@@ -14,13 +14,8 @@ if TYPE_CHECKING:
 
 
 class Tuning:
-    """Anneals the learning rate, and sets what has a schedule, of the learner and the environment.
-
-    Args:
-        trainer: whose budget they follow.
-
-    Raises:
-        ValueError: the budget anneals the learning rate of a learner without `set_lr`.
+    """Anneals the learning rate, and sets what has a schedule, of the learner and the environment,
+    by a trainer's budget. ValueError if it anneals the learning rate of a learner without `set_lr`.
     """
 
     def __init__(self, trainer: Trainer):
@@ -45,13 +40,8 @@ class Tuning:
         self.timetable = [*timetable]
 
     def set(self, values: Mapping[str, float]) -> None:
-        """Changes settings from the next update on, without waiting for the device.
-
-        Args:
-            values: numbers by key: `learner.NAME`, or `env.NAME`, of those that may be schedules.
-
-        Raises:
-            ValueError: a setting cannot change while training.
+        """Changes settings from the next update on, without waiting for the device: numbers by key,
+        `learner.NAME` or `env.NAME`, of those that may be schedules. ValueError for others.
         """
         for key, value in values.items():
             self._owner(key).set(**{key.partition(".")[2]: value})

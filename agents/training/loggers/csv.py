@@ -11,11 +11,7 @@ class CSV:
     """Writes `progress.csv` to a run's folder: a row per report, a column per metric.
 
     A metric that appears later gets a column at the end, for which the file is written again. A
-    cell is empty where a report lacks the metric.
-
-    Args:
-        folder: the run folder.
-        step: environment steps at which a resumed run starts; later rows are removed.
+    cell is empty where a report lacks the metric. A resumed run's rows after `step` are removed.
     """
 
     def __init__(self, folder: Path, step: int):

@@ -22,12 +22,7 @@ class TensorBoard:
     """Writes TensorBoard event files to the folder `tensorboard` of a run, in a thread.
 
     At the end of a run it has the settings as hyperparameters with the final numbers, the film, and
-    the table of the evaluation.
-
-    Args:
-        folder: the run folder.
-        step: environment steps at which a resumed run starts; later events are discarded.
-        config: settings of the run.
+    the table of the evaluation. A resumed run's events after `step` are discarded.
     """
 
     def __init__(self, folder: Path, step: int, config: dict | None = None):
