@@ -142,7 +142,7 @@ class GradientLearner:
                     "or a schedule of lr"
                 )
             self.read_lr = self.coefficients.tensors["lr"].item
-        factors = {}
+        factors: dict = {}
         if self.critic_lr is not None and policy.critic is not None:
             factors = dict.fromkeys(policy.critic.parameters(), self.critic_lr / self.lr)
         layers = (p for name, p in policy.named_parameters() if p.ndim > 1 and "weight" in name)

@@ -14,7 +14,7 @@ import torch
 from megastep import arrdict
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.networks.fused import fused
-from megastep.agents.networks.mingru import linear_scan
+from megastep.agents.networks.linear import linear_scan
 from megastep.coefficients import on_device
 from megastep.kernels.build.launch import launch
 

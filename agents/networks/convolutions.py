@@ -20,9 +20,8 @@ from torch.autograd.function import once_differentiable
 from megastep import spaces
 from megastep.agents.networks.fused import aligned, aligned_rows, fused, has_hopper
 from megastep.agents.networks.intakes import Encoder
-from megastep.agents.networks.linear import sum_rows
-from megastep.agents.networks.precision import cast as cast_weight
-from megastep.agents.networks.precision import compute_dtype
+from megastep.agents.networks.linear import cast as cast_weight
+from megastep.agents.networks.linear import compute_dtype, sum_rows
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 

@@ -18,13 +18,14 @@ from megastep.agents.networks.fused import LIBRARY, aligned, fused, is_plain_on_
 from megastep.agents.networks.heads import MultiDiscreteOutput, Output
 from megastep.agents.networks.intakes import ConcatIntake
 from megastep.agents.networks.linear import (
+    cast,
+    compute_dtype,
     gradient_of_inputs,
     gradient_of_weights,
     linear,
     product,
     sum_rows,
 )
-from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.agents.networks.running_norm import (
     RESOLUTION,
     masked_moments,

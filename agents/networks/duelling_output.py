@@ -10,13 +10,14 @@ from megastep import spaces
 from megastep.agents.networks.fused import LIBRARY, aligned, fused
 from megastep.agents.networks.heads import FORBIDDEN, Output, gather
 from megastep.agents.networks.linear import (
+    cast,
+    compute_dtype,
     gradient_of_inputs,
     gradient_of_weights,
     linear,
     product,
     sum_rows,
 )
-from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
 
 _MAX_OUTPUTS, _STRIP, _THREADS = (

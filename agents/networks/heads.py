@@ -22,8 +22,7 @@ from torch.autograd.function import once_differentiable
 from megastep import spaces
 from megastep.agents.networks.fused import DTYPES, LIBRARY, fused
 from megastep.agents.networks.intakes import ConcatIntake
-from megastep.agents.networks.linear import linear
-from megastep.agents.networks.precision import cast, compute_dtype
+from megastep.agents.networks.linear import cast, compute_dtype, linear
 from megastep.arrdict import arrdict
 from megastep.imports import import_object
 from megastep.kernels.build.launch import launch

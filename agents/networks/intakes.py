@@ -14,8 +14,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.fused import LIBRARY, fused
-from megastep.agents.networks.linear import ACTIVATIONS, linear
-from megastep.agents.networks.precision import compute_dtype
+from megastep.agents.networks.linear import ACTIVATIONS, compute_dtype, linear
 from megastep.agents.networks.running_norm import (
     MAX_LEAVES,
     RunningNorm,

@@ -32,13 +32,15 @@ from megastep.agents.networks.fused import (
     launch_units,
 )
 from megastep.agents.networks.linear import (
+    cast,
+    cast_joined,
+    compute_dtype,
     gradient_of_inputs,
     gradient_of_weights,
     matmul,
     product,
     sum_rows,
 )
-from megastep.agents.networks.precision import cast, cast_joined, compute_dtype
 from megastep.arrdict import arrdict
 from megastep.devices import threads
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary

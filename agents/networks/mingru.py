@@ -32,8 +32,14 @@ from megastep.agents.networks.fused import (
     has_hopper,
     launch_units,
 )
-from megastep.agents.networks.linear import gradient_of_weights, product, sum_rows
-from megastep.agents.networks.precision import cast, compute_dtype
+from megastep.agents.networks.linear import (
+    cast,
+    compute_dtype,
+    gradient_of_weights,
+    linear_scan,
+    product,
+    sum_rows,
+)
 from megastep.arrdict import arrdict
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
@@ -46,39 +52,6 @@ _LANES, _UNITS, _PARTS, _THREADS = (
 WIDTHS = tuple(range(_UNITS, (_PARTS + 1) * _UNITS, _UNITS))
 _LARGEST_BLOCK = 256  # threads, of the backward kernel
 _MANY_BLOCKS = 128  # about one per multiprocessor
-
-
-def linear_scan(
-    terms: torch.Tensor,
-    factors: torch.Tensor,
-    reset: torch.Tensor | None = None,
-    reverse: bool = False,
-) -> torch.Tensor:
-    """Computes y_t = terms_t + factors_t y_{t-1}, y_{-1} = 0, along the first axis.
-
-    Uses parallel doubling (Hillis and Steele 1986): after a pass of stride k, `total` holds the
-    last 2k terms of each sum, `product` the factor of what comes before them, and `reset` whether
-    that is cut off. Nothing is divided, so factors of 0 are exact.
-
-    Args:
-        terms, factors: (T, ...).
-        reset: bool, broadcasts to them. Where true, y_t = terms_t: not even a NaN passes.
-        reverse: runs from the end instead, y_t = terms_t + factors_t y_{t+1}, y_T = 0.
-    """
-    if reverse:
-        reset = None if reset is None else reset.flip(0)
-        return linear_scan(terms.flip(0), factors.flip(0), reset).flip(0)
-    total, product, stride = terms, factors, 1
-    while stride < len(terms):
-        first, here, before = slice(stride), slice(stride, None), slice(-stride)
-        sums = torch.addcmul(total[here], product[here], total[before])
-        if reset is not None:
-            sums = torch.where(reset[here], total[here], sums)
-            reset = torch.cat([reset[first], reset[here] | reset[before]])
-        total = torch.cat([total[first], sums])
-        product = torch.cat([product[first], product[here] * product[before]])
-        stride *= 2
-    return total
 
 
 def _split(gates) -> tuple[torch.Tensor, torch.Tensor]:

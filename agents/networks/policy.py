@@ -15,7 +15,7 @@ from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, heads, intakes, running_norm
-from megastep.agents.networks.precision import ComputeDtype
+from megastep.agents.networks.linear import ComputeDtype
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
 from megastep.imports import import_path, known_name

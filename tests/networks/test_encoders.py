@@ -9,7 +9,7 @@ from torch.nn import functional
 from megastep import spaces
 from megastep.agents.networks import convolutions as kernels
 from megastep.agents.networks import heads
-from megastep.agents.networks.precision import ComputeDtype
+from megastep.agents.networks.linear import ComputeDtype
 from megastep.arrdict import arrdict
 
 BF16 = torch.bfloat16

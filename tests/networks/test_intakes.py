@@ -6,7 +6,7 @@ import torch
 from megastep import spaces
 from megastep.agents.networks import heads, intakes, running_norm
 from megastep.agents.networks.fused import plain_operations
-from megastep.agents.networks.precision import ComputeDtype
+from megastep.agents.networks.linear import ComputeDtype
 from megastep.arrdict import arrdict
 
 IMAGE = spaces.MultiImage(2, 3, 1, 16)

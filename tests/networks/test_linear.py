@@ -11,7 +11,7 @@ from torch import nn
 from megastep import engine
 from megastep.agents.networks import linear
 from megastep.agents.networks.fused import aligned_rows
-from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined, rounded
+from megastep.agents.networks.linear import ComputeDtype, cast, cast_joined, rounded
 
 BF16 = dict(rtol=0, atol=2e-2)  # times the largest number: 8 bits, and sums of them
 

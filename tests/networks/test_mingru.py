@@ -9,7 +9,8 @@ from torch.nn import functional
 
 from megastep.agents.networks import mingru as mingru_module
 from megastep.agents.networks.fused import plain_operations
-from megastep.agents.networks.mingru import MinGRU, linear_scan
+from megastep.agents.networks.linear import linear_scan
+from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
 from tests.helpers.recurrent import assert_close
 
