@@ -123,25 +123,19 @@ class _Lowering:
     def normalise(self, leaf: Leaf, norm, encoder, out: Ref, out_stride: int) -> None:
         if leaf.dtype not in KINDS:
             raise UserError(f"a page has no observations of {leaf.dtype}")
-        shape, n_axes = leaf.shape[1:], len(leaf.shape) - 1
-        sizes = [1] * (4 - n_axes) + [*shape]
-        strides = [0] * (4 - n_axes) + [*leaf.strides[1:]]
+        shape = leaf.shape[1:]
+        n_missing = 4 - len(shape)
+        sizes, strides = [1] * n_missing + [*shape], [0] * n_missing + [*leaf.strides[1:]]
         mean = scale = None
         if isinstance(norm, RunningNorm):
             mean, scale = (self.weights(part.expand(shape)) for part in (norm.mean, norm.scale))
-        choices = len(encoder.values) if isinstance(encoder, OneHot) else 0
         self.launch(
             "policy_normalise",
-            obs=self.of_lanes(leaf),
-            mean=mean,
-            scale=scale,
-            out=out,
-            kind=KINDS[leaf.dtype],
+            **dict(obs=self.of_lanes(leaf), mean=mean, scale=scale, out=out),
             **{f"size{i}": size for i, size in enumerate(sizes)},
             **{f"stride{i}": stride for i, stride in enumerate(strides)},
-            obs_stride=leaf.strides[0],
-            out_stride=out_stride,
-            choices=choices,
+            **dict(kind=KINDS[leaf.dtype], obs_stride=leaf.strides[0], out_stride=out_stride),
+            choices=len(encoder.values) if isinstance(encoder, OneHot) else 0,
         )
 
     def convolve(self, leaf: Leaf, norm, encoder, out: Ref, out_stride: int) -> None:
@@ -155,7 +149,7 @@ class _Lowering:
         n = n_agents * math.prod(shape)
         x = self.scratch(n)
         self.normalise(leaf, norm, encoder, x, n)
-        for i, layer in enumerate(layers):
+        for layer in layers:
             own = layer.kernel_size, layer.stride, cast("tuple[int, ...]", layer.padding)
             rows = 1, 1, 0  # of a convolution of rows
             kernel, stride, padding = (
@@ -166,26 +160,18 @@ class _Lowering:
                 for size, pad, k, step in zip(shape[1:], padding, kernel, stride)
             ]
             n_out = n_agents * layer.out_channels * math.prod(sizes)
-            is_last = i == len(layers) - 1
+            is_last = layer is layers[-1]
             target, target_stride = (out, out_stride) if is_last else (self.scratch(n_out), n_out)
+            weight, bias = self.weights(layer.weight.movedim(0, -1)), self.weights(layer.bias)
             self.launch(
                 "policy_convolve",
-                x=x,
-                weight=self.weights(layer.weight.movedim(0, -1)),
-                bias=self.weights(layer.bias),
-                out=target,
-                n_images=n_agents,
-                n_in=shape[0],
-                height=shape[1],
-                width=shape[2],
-                n_out=layer.out_channels,
-                out_height=sizes[0],
-                out_width=sizes[1],
+                **dict(x=x, weight=weight, bias=bias, out=target, n_images=n_agents),
+                **dict(zip(("n_in", "height", "width"), shape)),
+                **dict(n_out=layer.out_channels, out_height=sizes[0], out_width=sizes[1]),
                 **dict(zip(("kernel_h", "kernel_w"), kernel)),
                 **dict(zip(("stride_h", "stride_w"), stride)),
                 **dict(zip(("padding_h", "padding_w"), padding)),
-                x_stride=n,
-                out_stride=target_stride,
+                **dict(x_stride=n, out_stride=target_stride),
             )
             x, n, shape = target, n_out, (layer.out_channels, *sizes)
 
@@ -209,25 +195,17 @@ class _Lowering:
                 f"a page has no recurrent core {kind.__name__}; it has "
                 f"agent.core={', '.join(CORES)}"
             )
-        n_gates = {LSTM: 4, GRU: 3, MinGRU: 2}[kind]
-        gates, output = self.scratch(n_gates * width), self.state(width)
+        n = {LSTM: 4, GRU: 3, MinGRU: 2}[kind] * width
+        gates, output = self.scratch(n), self.state(width)
         cell = self.state(width) if kind is LSTM else None
-        self.linear(x, core.input, gates, width, n_gates * width)
-        recurrent = None
-        if kind is LSTM:
-            self.linear(output, core.recurrent, gates, width, n_gates * width, adds=1)
-        elif kind is GRU:
-            recurrent = self.scratch(n_gates * width)
-            self.linear(output, core.recurrent, recurrent, width, n_gates * width)
-        self.launch(
-            f"policy_{kind.__name__.lower()}",
-            gates=gates,
-            recurrent=recurrent,
-            output=output,
-            cell=cell,
-            x=x,
-            width=width,
-        )
+        self.linear(x, core.input, gates, width, n)
+        recurrent = self.scratch(n) if kind is GRU else None
+        if kind is not MinGRU:
+            self.linear(
+                output, core.recurrent, recurrent or gates, width, n, adds=int(kind is LSTM)
+            )
+        parts = dict(gates=gates, recurrent=recurrent, output=output, cell=cell)
+        self.launch(f"policy_{kind.__name__.lower()}", **parts, x=x, width=width)
 
     def state(self, width: int) -> Ref:
         """Adds a hidden state, which is cleared where an episode starts."""
@@ -250,7 +228,9 @@ class _Lowering:
         n_logits = n if isinstance(output, (MultiDiscreteOutput, DuellingOutput)) else 2 * n
         logits = self.scratch(n_agents * n_logits)
         values: dict = {}
+        operation = "policy_softmax"
         if isinstance(output, DuellingOutput):
+            operation = "policy_duelling"
             hidden, scores, value = map(self.scratch, (2 * width, n_agents * n, n_agents))
             self.linear(x, output.hidden, hidden, width, 2 * width, ACTIVATIONS[torch.relu])
             # value and advantage each read their half of the hidden layer
@@ -260,31 +240,21 @@ class _Lowering:
                 whole.bias = layer.bias
                 self.linear(hidden, whole, out, 2 * width, len(layer.weight))
             values = dict(values=value, epsilon=output.epsilon)
-            operation = "policy_duelling"
         else:
             n_scores = len(output.linear.weight)
             scores = self.scratch(n_scores)
             self.linear(x, output.linear, scores, width, n_scores)
-            operation = "policy_softmax"
         if isinstance(output, (GaussianOutput, BetaOutput)):
-            values = dict(low=self.weights(output.low), high=self.weights(output.high))
             operation = "policy_beta"
+            values = dict(low=self.weights(output.low), high=self.weights(output.high))
         if isinstance(output, GaussianOutput):
-            values |= dict(values=self.weights(output.log_std))
             operation = "policy_gaussian"
+            values |= dict(values=self.weights(output.log_std))
         key = "numbers" if n_logits > n else "actions"
-        self.launch(
-            operation,
-            scores=scores,
-            **values,
-            logits=logits,
-            **{key: self.of_lanes(self.program.actions)},
-            counts=self.program.add(torch.zeros(self.n, dtype=torch.int32)),
-            key0=self.seed & 0xFFFFFFFF,
-            key1=self.seed >> 32,
-            first=self.lanes.start,
-            n_agents=n_agents,
-            n_choices=n,
-        )
+        values |= dict(zip(("n_agents", "n_choices", "first"), (n_agents, n, self.lanes.start)))
+        counts = self.program.add(torch.zeros(self.n, dtype=torch.int32))
+        values |= dict(counts=counts, key0=self.seed & 0xFFFFFFFF, key1=self.seed >> 32)
+        values[key] = self.of_lanes(self.program.actions)
+        self.launch(operation, scores=scores, logits=logits, **values)
         shape = self.n, n_agents, n_logits
         return Leaf(logits, shape, (n_agents * n_logits, n_logits, 1), torch.float32)
