@@ -8,7 +8,7 @@ from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
 from megastep.agents.evaluation import eval_env, playing, ratings, statistics, tables
 from megastep.agents.evaluation.eval_env import EvalEnv, Player
-from megastep.agents.factory import env_failures, settings
+from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.types import optional
 
@@ -41,7 +41,7 @@ def run(cfg: settings.Evaluate) -> Path:
     with env_failures.caught(env_settings, folder, rank=rank):
         if cfg.ratings:
             where = EvalEnv(env_settings, homes, **options)
-            path = ratings.write(cfg, loaded, where, tables.labels(where, geometry, cfg.split))
+            path = ratings.write(cfg, loaded, where, geometry)
         else:
             path = _measure(cfg, loaded, env_settings, geometry, homes, options)
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
@@ -62,13 +62,19 @@ def _measure(cfg, loaded, env_settings, geometry, homes, options) -> Path:
             where.warn_without_layout()
     if process_group.rank() > 0:
         return folders.folder_of(loaded.path)
-    labels = tables.labels(where, geometry, cfg.split)
-    title, rows = tables.title_of(labels, geometry, rows, "duels" if cfg.against else "lanes")
-    names = [labels.source, "env" if cfg.env else "", cfg.split, str(loaded.step)]
+    is_duel, is_suite = cfg.against is not None, geometry.name == components.SUITE
+    n_homes = {row.get("source"): row["homes"] or 0 for row in reversed(rows)}
+    n_homes = n_homes.get(None) or sum(n_homes.values())
+    what = f"{rows[0]['duels']:,} duels" if is_duel else f"{rows[0]['lanes']:,} episodes"
+    what += " in each source" * is_suite
+    title = tables.title_of(where, geometry, cfg.split, what, n_homes)
+    rows = tables.with_worst_sources(rows, "against" if is_duel else "agent") if is_suite else rows
+    names = [tables.source_of(where, geometry), "env" * (cfg.env is not None), cfg.split]
     if cfg.against is not None:
-        names = ["duels", labels.source, cfg.split, str(loaded.step), "against", *cfg.against]
+        names = ["duels", names[0], cfg.split, str(loaded.step), "against", *cfg.against]
         title = f"{eval_env.name_of(loaded)}, in {title}, seed {cfg.seed}"
     else:
+        names.append(str(loaded.step))
         title += f", after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}"
     return tables.write_table(cfg, loaded, names, title, rows, differences, episodes)
 

@@ -1,6 +1,5 @@
 """Films a trained policy, or random actions."""
 
-import contextlib
 import itertools
 from pathlib import Path
 from typing import cast
@@ -59,15 +58,13 @@ def run(cfg: settings.Record) -> Path:
             shown.append(recording.Player(env, policy, title or cfg.title))
     look = {name: getattr(cfg, name) for name in ("theme", "dpi", "speed", "trail")}
     look["show"] = console.count
-    with contextlib.ExitStack() as undo:
-        path = Path(cfg.file or take_free_name(folder / "video.mp4"))
-        if not cfg.file:
-            undo.callback(path.unlink, missing_ok=True)
-        # a video is the last thing that a run should fail for
-        problem = f"The video {path} could not be made: "
-        with env_failures.caught(env_settings, folder), user_errors(problem, (Exception,)):
-            recording.film_all(shown, path, cfg.steps, cfg.greedy, cfg.seed, **look)
-        undo.pop_all()
+    names = (f"video{f'-{n}' * (n > 1)}.mp4" for n in itertools.count(1))
+    free = (folder / name for name in names if not (folder / name).exists())
+    path = Path(cfg.file or next(free))
+    # a video is the last thing that a run should fail for
+    problem = f"The video {path} could not be made: "
+    with env_failures.caught(env_settings, folder), user_errors(problem, (Exception,)):
+        recording.film_all(shown, path, cfg.steps, cfg.greedy, cfg.seed, **look)
     each = "one environment" if len(shown) == 1 else f"{len(shown)} environments"
     console.say(f"Filmed {cfg.steps} steps of {each}: {path}")
     return path
@@ -84,15 +81,3 @@ def _player(cfg, loaded, first, env_settings, env) -> PolicyLike:
     console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
     slot = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
     return playing.duel_policy(policy, opponent.policy, slot, optional(env, "n_agents"))
-
-
-def take_free_name(path: Path) -> Path:
-    """Creates an empty file, `video.mp4` or else `video-2.mp4` and so on, and returns its path."""
-    with user_errors(f"The video {path} could not be made: "):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for number in itertools.count(1):
-            name = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
-            with contextlib.suppress(FileExistsError):
-                name.touch(exist_ok=False)
-                return name
-    raise AssertionError("counting never ends")

@@ -37,7 +37,7 @@ COLUMNS = {
 
 
 def write(
-    cfg: settings.Evaluate, run: checkpoint.Checkpoint, where: EvalEnv, labels: tables.Labels
+    cfg: settings.Evaluate, run: checkpoint.Checkpoint, where: EvalEnv, geometry: settings.Geometry
 ) -> Path:
     """Rates a run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels of
     each with each. Prints a table, writes ratings.csv into the run's folder, and returns its path.
@@ -75,7 +75,8 @@ def write(
         table.append(about | dict(won=sum(results) / len(results), duels=len(results)))
     layouts, what = played[0, 1].get("homes"), f"{where.shard.n_envs:,} duels of each pair"
     n_homes = None if layouts is None else len(layouts.unique())
-    title = f"Ratings in {labels.title(what, n_homes)}, seed {cfg.seed}"
+    title = tables.title_of(where, geometry, cfg.split, what, n_homes)
+    title = f"Ratings in {title}, seed {cfg.seed}"
     cells = [[form.format_map(row) for form in COLUMNS.values()] for row in table]
     console.say(f"{title}\n{console.table([*COLUMNS], cells)}")
     with user_errors(f"{folder} cannot be written: "):

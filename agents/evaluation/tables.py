@@ -5,7 +5,6 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from megastep.agents import console
 from megastep.agents.errors import user_errors
@@ -24,29 +23,23 @@ INTERVAL = "95 % interval"
 DENSE = "dense"
 
 
-class Labels(NamedTuple):
-    """Where a run is evaluated."""
-
-    env: str  # the environment's name
-    source: str  # that of the homes, or of the environment if there are none, for file names
-    choice: str  # of homes, for titles; empty if there are none
-
-    def title(self, what: str, n_homes: int | None) -> str:
-        """`minimal: 1,024 episodes in 512 homes, geometry=homes, split=test`."""
-        homes = f" in {n_homes:,} home{'s' * (n_homes > 1)}" if n_homes else ""
-        return f"{self.env}: {what}{homes}{self.choice}"
-
-
-def labels(where: EvalEnv, geometry: Geometry, split: str) -> Labels:
-    """Returns how tables name an environment and its homes."""
-    env = env_name(where.settings)
+def title_of(where: EvalEnv, geometry: Geometry, split: str, what: str, n_homes: int | None) -> str:
+    """`minimal: 1,024 episodes in 512 homes, geometry=homes, split=test`."""
+    homes = f" in {n_homes:,} home{'s' * (n_homes > 1)}" if n_homes else ""
+    text = f"{env_name(where.settings)}: {what}{homes}"
     if not where.homes:
-        return Labels(env, env, "")
-    path = Path(getattr(geometry, "path", None) or "")
-    short = label(geometry.name)
-    name = short if geometry.name.startswith("megastep.") else geometry.name
-    choice = f", geometry={name}{f' ({path.name})' * bool(path.name)}, split={split}"
-    return Labels(env, "-".join(filter(None, [short, path.stem])), choice)
+        return text
+    name = label(geometry.name) if geometry.name.startswith("megastep.") else geometry.name
+    file = Path(getattr(geometry, "path", None) or "").name
+    return f"{text}, geometry={name}{f' ({file})' * bool(file)}, split={split}"
+
+
+def source_of(where: EvalEnv, geometry: Geometry) -> str:
+    """Returns the source of the homes, or the environment if there are none, for file names."""
+    if not where.homes:
+        return env_name(where.settings)
+    file = Path(getattr(geometry, "path", None) or "").stem
+    return "-".join(filter(None, [label(geometry.name), file]))
 
 
 def write_table(
@@ -157,24 +150,13 @@ def parts_of(geometry: Geometry, homes: list) -> list[tuple[str | None, list]]:
     return [*parts.items()]
 
 
-def title_of(
-    labels: Labels, geometry: Geometry, rows: list[dict], what: str
-) -> tuple[str, list[dict]]:
-    """Returns the title of a table, and its rows: of a suite with the worst source of each agent or
-    opponent once more at its end. `what` is the key of the number of episodes.
+def with_worst_sources(rows: list[dict], who: str) -> list[dict]:
+    """Returns the rows of a suite with the worst source of each agent or opponent, by the key
+    `who`, once more at its end.
     """
-    who, name = ("agent", "episodes") if what == "lanes" else ("against", what)
-    is_suite = geometry.name == components.SUITE
-    text = f"{rows[0][what]:,} {name}{' in each source' * is_suite}"
-    by_source = {}
-    for row in rows:
-        by_source.setdefault(row.get("source"), row["homes"] or 0)
-    title = labels.title(text, by_source.get(None) or sum(by_source.values()))
-    if not is_suite:
-        return title, rows
     ordered = []
     for one in dict.fromkeys(row[who] for row in rows):
         of_one = [row for row in rows if row[who] == one]
         whole = [row for row in of_one if not {"role", "tail"} & row.keys()]
         ordered += [*of_one, {**min(whole, key=score_of), "is_worst": True}]
-    return title, ordered
+    return ordered
