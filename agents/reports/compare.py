@@ -7,6 +7,7 @@ import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,8 @@ def write(
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
     if legend != "none":
-        texts += axes.legend(fontsize="small", loc=legend.replace("-", " ")).get_texts()
+        place: Any = legend.replace("-", " ")
+        texts += axes.legend(fontsize="small", loc=place).get_texts()
     for text in texts:
         text.set_parse_math(False)  # a $ is a $
     plot, text = io.BytesIO(), io.StringIO()

@@ -18,7 +18,7 @@ def iqm(scores: ArrayLike) -> float:
     """Returns the interquartile mean: of the middle half of all scores, of any shape. A quarter of
     them, rounded down, is left out at either end.
     """
-    return float(stats.trim_mean(scores, 0.25, axis=None))
+    return float(stats.trim_mean(np.ravel(scores), 0.25))
 
 
 def interval(
