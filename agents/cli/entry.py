@@ -36,15 +36,14 @@ def main() -> int:
     console.open_streams()
     if name == "--version":
         console.say(package.version())
-    elif name not in ("-h", "--help"):
-        text = f"{name!r} is unknown; {closest(name, COMMANDS)}"
-        console.say(f"megastep: {text}", sys.stderr)
-        return 2
-    else:
+    elif name in ("-h", "--help"):
         names = {package.command(name, "python -m "): text for name, text in COMMANDS.items()}
         for name, text in names.items():
             console.say(f"  {name:<{max(map(len, names))}}  {text}")
         console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
+    else:
+        console.say(f"megastep: {name!r} is unknown; {closest(name, COMMANDS)}", sys.stderr)
+        return 2
     return 0
 
 

@@ -29,9 +29,7 @@ adapter = functools.cache(TypeAdapter)
 def _wrappers(value: object) -> tuple[object, ...]:
     """Returns the wrappers of an environment: names, and dicts of `name` and settings."""
     items = [value] if isinstance(value, (str, dict)) else value
-    if not isinstance(items, (list, tuple)):
-        raise ValueError(f"expected a list of wrappers, got {value!r}")
-    for item in items:
+    for item in items if isinstance(items, (list, tuple)) else [items]:
         name, known = item.get("name") if isinstance(item, dict) else item, members("wrapper")
         if not isinstance(name, str):
             raise ValueError(f"a wrapper is a name or {{name: ..., setting: ...}}, got {item!r}")
@@ -39,7 +37,7 @@ def _wrappers(value: object) -> tuple[object, ...]:
             raise ValueError(f"{name!r} is not a wrapper; {closest(name, known)}, or module:Class")
         if name in known or isinstance(item, dict):
             wrapper_settings(item)
-    return tuple(items)
+    return tuple(items)  # pyright: ignore[reportArgumentType]
 
 
 def wrapper_settings(item: "str | dict") -> Any:

@@ -2,7 +2,6 @@
 
 import contextlib
 import inspect
-import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,11 +30,13 @@ def caught(
         if not (failure := _failure(error, env)):
             raise
         is_sentence = isinstance(error, UserError)  # that a video could not be made because of it
-        text = [str(error if is_sentence else failure).rstrip(".")]
+        text = [str(error if is_sentence else failure).rstrip("."), saved()]
         if failure.trace:
-            name = f"rank_{rank}_{FILE}" if rank else FILE
-            text.append(f"Its traceback is in {_write(folder, name, failure.trace)}")
-        raise EnvFailed(". ".join(filter(None, [*text, saved()]))) from error
+            path = folder / (f"rank_{rank}_{FILE}" if rank else FILE)
+            with contextlib.suppress(OSError):
+                path.write_text(failure.trace, "utf-8", "backslashreplace")
+                text.insert(1, f"Its traceback is in {path}")
+        raise EnvFailed(". ".join(filter(None, text))) from error
 
 
 def _failure(error, env) -> EnvError | None:
@@ -59,13 +60,3 @@ def _failure(error, env) -> EnvError | None:
     if not frames:
         return None
     return EnvError(f"{env.name} failed: {one_line(error)}", trace)
-
-
-def _write(folder, name, trace) -> object:
-    """Writes a traceback into a folder, or a temporary one. Returns the path."""
-    for place in (folder, Path(tempfile.gettempdir())):
-        with contextlib.suppress(OSError):
-            path = place / name
-            path.write_text(trace, "utf-8", "backslashreplace")
-            return path
-    return "no file, as none can be written"

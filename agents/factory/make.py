@@ -12,17 +12,8 @@ from megastep import contract, engine, scene, spaces, types
 from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, components
-from megastep.agents.factory.settings import (
-    Agent,
-    Env,
-    Geometry,
-    Learner,
-    Train,
-    Trained,
-    changed,
-    env_name,
-    label,
-)
+from megastep.agents.factory.components import env_name, label
+from megastep.agents.factory.settings import Agent, Env, Geometry, Learner, Train, Trained, changed
 from megastep.agents.generator import stream_seed
 from megastep.agents.hardware import make_device as make_device
 from megastep.agents.hardware import share_threads
@@ -49,18 +40,10 @@ PROBE = 65
 SAMPLE, SAMPLE_STEPS = 4, 16
 #: What the library raises for bad arguments, files and devices, and for too little memory.
 KINDS = (
-    ValueError,
-    OSError,
-    torch.OutOfMemoryError,
-    engine.EngineError,
-    checkpoint.CheckpointError,
-    loggers.LoggerError,
-    LearnerError,
-    contract.ContractError,
+    *(ValueError, OSError, torch.OutOfMemoryError, engine.EngineError, contract.ContractError),
+    *(checkpoint.CheckpointError, loggers.LoggerError, LearnerError),
 )
-
-
-#: Turns errors of the library into a UserError that begins with a prefix. For setting up.
+#: Turns these errors into a UserError that begins with a prefix. For setting up.
 errors = functools.partial(user_errors, kinds=KINDS)
 
 
@@ -121,14 +104,12 @@ def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
 
 def typed_or(geometry: Geometry, typed: Geometry | None, env: Env) -> Geometry:
     """Returns the geometry that was typed, else the other. UserError if `env` takes none."""
-    if typed is None:
-        return geometry
-    if not components.takes_geometries(env.name):
+    if typed is not None and not components.takes_geometries(env.name):
         raise UserError(
             f"{env_name(env)} takes no floor plans, so it cannot be played in "
             f"geometry={label(typed.name)}; leave geometry out"
         )
-    return typed
+    return geometry if typed is None else typed
 
 
 def spread(homes: list[dict], n_envs: int) -> list[dict]:
@@ -195,10 +176,8 @@ def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> "agent_typ
     learner = construct(settings, policy=policy, seed=seed, graph=True)
     with errors(f"{settings.name} is not a learner: "):
         check_learner(learner)
-        try:
-            check_plain(learner.state_dict(), "state_dict")
-        except TypeError as error:
-            raise LearnerError(error) from error
+    with user_errors(f"{settings.name} is not a learner: ", (TypeError,)):
+        check_plain(learner.state_dict(), "state_dict")
     return learner
 
 
@@ -222,17 +201,17 @@ def make_opponents(
     cfg: Train, env: types.Env, sample: types.Env, policy: Policy, seed: int = 1
 ) -> Opponents | None:
     """Returns the environment with opponents in it, None if none. A `sample` tries the bot."""
-    options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
-    if not (cfg.opponents.past or cfg.opponents.bot or cfg.opponents.league):
+    chosen, bot = cfg.opponents, None
+    if not (chosen.past or chosen.bot or chosen.league):
         return None
-    bot = None
-    if cfg.opponents.bot:
-        bot = in_env(make_bot(cfg.opponents.bot_class, cfg.env, sample), cfg.env, env)
+    if chosen.bot:
+        bot = in_env(make_bot(chosen.bot_class, cfg.env, sample), cfg.env, env)
     with errors():
-        if cfg.opponents.past or cfg.opponents.league:
+        if chosen.past or chosen.league:
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
             n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
-            engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")
+            engine.fit(chosen.snapshots, n_bytes, env.device, "snapshots")
+        options = {key: value for key, value in vars(chosen).items() if key != "bot_class"}
         return Opponents(env, policy, bot, seed=seed, **options)
 
 

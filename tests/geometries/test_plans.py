@@ -149,7 +149,7 @@ def test_archive_becomes_a_database(data_folder, capsys, monkeypatch):
     monkeypatch.setattr(console, "LINE_EVERY", 0)
     assert run(*words, "licence=accept") == 0
     out = capsys.readouterr().out
-    assert "\n2 of 2 files\n" in out and "2 floor plans of 2 files" in out
+    assert "\n2 of 2 files" in out and "2 floor plans of 2 files" in out
     names = sorted(path.name for path in data_folder.iterdir())
     assert names == ["cubicasa.md", "cubicasa.npz", "cubicasa.png"]
     npz = data_folder / "cubicasa.npz"
