@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import annotated_types
 import pydantic.dataclasses
 from pydantic.fields import FieldInfo
-from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
+from pydantic_core import ValidationError
 
 if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
@@ -247,8 +247,6 @@ def sentence(error: Mapping, field: FieldInfo | None, value: object) -> str:
         return f"is one value, not a schedule, got {got}"
     if kind == "missing":
         return "is missing"
-    if kind == "located":
-        return error["msg"]
     if kind == "value_error":
         return str(error["ctx"]["error"])
     if kind in OUTSIDE or isinstance(value, float) and not math.isfinite(value):
@@ -294,16 +292,3 @@ def closest(word: object, words: Iterable[object]) -> str:
     names = sorted(str(w) for w in words)
     near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
     return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
-
-
-def located(errors: Iterable[tuple[str, str]]) -> ValidationError:
-    """Returns a pydantic error with a sentence for each dotted key."""
-    lines = [
-        InitErrorDetails(
-            type=PydanticCustomError("located", "{text}", {"text": text}),
-            loc=tuple(key.split(".")),
-            input=None,
-        )
-        for key, text in errors
-    ]
-    return ValidationError.from_exception_data("settings", lines)

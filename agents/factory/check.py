@@ -37,6 +37,8 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
                 text = sentence(line, field, line["input"]) if field else line["msg"]
             errors.setdefault(".".join(path) or "configuration", text)
         raise ConfigErrors(errors.items()) from None
+    if conflicts := [*getattr(chosen, "conflicts", tuple)()]:
+        raise ConfigErrors(conflicts)
     as_tree(chosen)
     return cast(T, chosen)
 

@@ -11,18 +11,13 @@ import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import components, conflicts
 from megastep.agents.factory.components import env_name, label
 from megastep.agents.population.variation import Variation
 from megastep.imports import import_object
-from megastep.settings import closest, frozen, located
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
+from megastep.settings import frozen
 
 T = TypeVar("T")
 
@@ -109,7 +104,7 @@ def _group(group: str) -> object:
             raise ValueError(f"is a group of keys, got {value!r}")
         name = components.SINGLE.get(group) or value.get("name")
         if name is None:
-            raise ValueError(f"its keys need a member: give {group}= as well")
+            raise ValueError(f"has keys and is not chosen: give {group}= as well")
         return components.adapter(components.kind_of(group, str(name))).validate_python(value)
 
     return Annotated[Any, BeforeValidator(settings)]
@@ -141,20 +136,6 @@ def run_name(cfg: "Train") -> str:
     return "-".join([env_name(cfg.env), *geometry, str(cfg.seed)])
 
 
-def _chosen_loggers(tree) -> dict:
-    """Returns nested dicts of loggers by label. Raises for keys of loggers that were not chosen."""
-    errors, known = [], components.members("logger")
-    for key, value in tree.items() if isinstance(tree, dict) else ():
-        if not (dataclasses.is_dataclass(value) or isinstance(value, dict) and "name" in value):
-            text = f"no such logger, whose keys are logger.wandb.mode=; {closest(key, known)}"
-            if key in known:
-                text = f"is not chosen; add logger={key}, or logger=[tensorboard,{key}] for both"
-            errors.append((key, text))
-    if errors:
-        raise located(errors)
-    return tree
-
-
 if TYPE_CHECKING:
 
     class Component:
@@ -168,8 +149,6 @@ if TYPE_CHECKING:
 else:
     Env, Geometry, Learner, Curriculum, Logger = map(_group, components.CHOSEN)
     Agent, Opponents = map(_group, components.SINGLE)
-#: {label: settings}, such as {"wandb": ...}
-Loggers = Annotated[dict[str, Logger], BeforeValidator(_chosen_loggers)]
 
 
 # ---- Scripts ----
@@ -182,16 +161,6 @@ class Common:
     seed: Annotated[int, Field(ge=0, lt=2**63)]
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     trust: bool = False  # import what checkpoints that others made name
-
-    def conflicts(self) -> Iterator[tuple[str, str]]:
-        """Yields (dotted key, sentence) of settings that contradict each other."""
-        yield from ()
-
-    @model_validator(mode="after")
-    def _agree(self) -> "Self":
-        if errors := [*self.conflicts()]:
-            raise ConfigErrors(errors)
-        return self
 
 
 @frozen
@@ -245,7 +214,7 @@ class Train(Common):
     curriculum: Curriculum = cast("Curriculum", components.NoCurriculum(name="none"))
     opponents: Opponents = _default("opponents")
     population: Population = Population()
-    logger: Loggers = dataclasses.field(default_factory=dict)
+    logger: dict[str, Logger] = dataclasses.field(default_factory=dict)  # by label, such as wandb
     finish: Finish
     samples: Samples | None
     seconds: Seconds | None

@@ -96,10 +96,10 @@ def test_each_logger_has_settings_of_its_own():
 @pytest.mark.parametrize(
     "words, key, text",
     [
-        (["logger.mode=offline"], "logger.mode", "whose keys are logger.wandb.mode="),
-        (["logger.wandb.mode=offline"], "logger.wandb", "is not chosen; add logger=wandb, or"),
+        (["logger.mode=offline"], "logger.mode", "is a group of keys, got 'offline'"),
+        (["logger.wandb.mode=offline"], "logger.wandb", "is not chosen: give logger= as well"),
         (["logger=wandb", "logger.wandb.mod=x"], "logger.wandb.mod", "logger.wandb.mode?"),
-        (["logger.mlfow.uri=x"], "logger.mlfow", "there are csv"),
+        (["logger.mlfow.uri=x"], "logger.mlfow", "is not chosen: give logger= as well"),
         (["logger=[csv,wandbb]"], "logger", "'wandbb' is unknown; did you mean wandb?"),
         (["logger=[csv,nowhere:Memo]"], "logger.memo", "nowhere:Memo cannot be imported"),
         (["logger=pathlib:Path"], "logger.path", "cannot be used: it has no method write"),
