@@ -15,15 +15,14 @@ import functools
 import inspect
 import math
 import numbers
+import re
 import types
 import typing
 from collections import abc
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import annotated_types
 import pydantic.dataclasses
-from pydantic.fields import FieldInfo
 from pydantic_core import ValidationError
 
 if TYPE_CHECKING:
@@ -106,8 +105,6 @@ WANTED = {
     "dict": "keys with values",
 }
 BOUNDS = {"ge": "at least {:,}", "gt": "more than {:,}", "le": "at most {:,}", "lt": "below {:,}"}
-OUTSIDE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number")
-RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and below {:,}"}
 
 
 # ---- Settings from signatures ----
@@ -222,7 +219,7 @@ def checked(function: F) -> F:
             errors = {}
             for line in error.errors():
                 name = str(line["loc"][0])
-                errors.setdefault(name, sentence(line, fields[name], values[name]))
+                errors.setdefault(name, sentence(line))
             raise ValueError("; ".join(f"{k}: {text}" for k, text in errors.items())) from None
         return function(*args, **kwargs)
 
@@ -239,52 +236,28 @@ def plain(value: Any) -> Any:
 # ---- What is wrong, in words ----
 
 
-def sentence(error: Mapping, field: FieldInfo | None, value: object) -> str:
-    """Returns what is allowed of a `field`, and the `value` given, from an error of pydantic."""
-    kind, got = error["type"], "nothing" if value is None else repr(value)
-    is_schedule = isinstance(value, Mapping) and value.keys() == {"from", "to"}
-    if is_schedule and kind != "value_error":
-        return f"is one value, not a schedule, got {got}"
+def sentence(error: Mapping) -> str:
+    """Returns what is allowed, and what was given, from an error of pydantic."""
+    kind, value, facts = error["type"], error["input"], error.get("ctx", {})
+    got = "nothing" if value is None else repr(value)
     if kind == "missing":
         return "is missing"
     if kind == "value_error":
-        return str(error["ctx"]["error"])
-    if kind in OUTSIDE or isinstance(value, float) and not math.isfinite(value):
-        return f"{value} is out of range: allowed is {allowed(field)}"
-    if kind == "literal_error" and field:
-        return f"{value!r} is unknown; {closest(value, _words(field.annotation))}"
+        return str(facts["error"])
+    if isinstance(value, Mapping) and value.keys() == {"from", "to"}:
+        return f"is one value, not a schedule, got {got}"
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"{value} is out of range: allowed is any finite number"
+    for key in BOUNDS.keys() & facts.keys():
+        return f"{value} is out of range: allowed is {BOUNDS[key].format(_whole(facts[key]))}"
+    if kind == "literal_error":
+        words = re.findall("'([^']*)'", facts["expected"])
+        return f"{value!r} is unknown; {closest(value, words)}"
     if wanted := WANTED.get(kind.split("_")[0]):
         return f"expected {wanted}, got {got}"
     if kind.startswith("dataclass"):
         return f"is a group of keys, got {got}"
     return f"{error['msg'][0].lower()}{error['msg'][1:]}, got {got}"
-
-
-def allowed(field: FieldInfo | None) -> str:
-    """Returns the bounds of a number in words."""
-    bounds = {
-        key: getattr(extra, key)
-        for extra in (_metadata(field) if field else ())
-        for key in BOUNDS
-        if isinstance(extra, annotated_types.BaseMetadata) and getattr(extra, key, None) is not None
-    }
-    words = RANGES if len(bounds) == 2 else BOUNDS
-    texts = [words[key].format(bounds[key]) for key in BOUNDS if key in bounds]
-    return " ".join(texts) or "any finite number"
-
-
-def _metadata(field) -> Iterator[object]:
-    """Yields the metadata of `Annotated`, also inside `X | None`."""
-    yield from field.metadata
-    for option in typing.get_args(field.annotation):
-        for extra in getattr(option, "__metadata__", ()):
-            yield from extra.metadata if isinstance(extra, FieldInfo) else [extra]
-
-
-def _words(hint) -> Iterator[str]:
-    """Yields the words of a Literal, also of `Literal | None`."""
-    for option in typing.get_args(hint):
-        yield from [option] if isinstance(option, str) else _words(option)
 
 
 def closest(word: object, words: Iterable[object]) -> str:

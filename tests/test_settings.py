@@ -29,26 +29,24 @@ def messages(kind, **values):
 
 
 @pytest.mark.parametrize(
-    "bounds, inside, outside, allowed",
+    "bounds, inside, outside",
     [
-        (dict(ge=1, le=3), (1, 2, 3), (0, 4, NAN, math.inf), "from 1 to 3"),
-        (dict(gt=0, lt=180), (1e-9, 179.9), (0, 180, -1), "above 0 and below 180"),
-        (dict(gt=0), (1e-9, 1e300), (0, math.inf, -math.inf), "more than 0"),
-        (dict(ge=2), (2, 10**18), (1.5, math.inf), "at least 2"),
-        (dict(lt=2), (1.9, -5), (2, NAN), "below 2"),
-        (dict(ge=1, le=2**26), (2**26,), (2**26 + 1,), "from 1 to 67,108,864"),
-        (dict(), (-1e300, 0), (NAN, math.inf), "any finite number"),
+        (dict(ge=1, le=3), (1, 2, 3), {0: "at least 1", 4: "at most 3", NAN: "any finite number"}),
+        (dict(gt=0, lt=180), (1e-9, 179.9), {0: "more than 0", 180: "below 180"}),
+        (dict(ge=2), (2, 10**18), {1.5: "at least 2", math.inf: "any finite number"}),
+        (dict(ge=1, le=2**26), (2**26,), {2**26 + 1: "at most 67,108,864"}),
+        (dict(), (-1e300, 0), {NAN: "any finite number", math.inf: "any finite number"}),
     ],
 )
 @pytest.mark.parametrize("optional", [False, True])
-def test_out_of_range(bounds, inside, outside, allowed, optional):
+def test_out_of_range(bounds, inside, outside, optional):
     hint = Annotated[float, Field(**bounds)] if bounds else float
 
     def f(x: hint | None if optional else hint): ...
 
     kind = settings_of(f)
     assert [check(kind, {"x": value}).x for value in inside] == list(inside)
-    for value in outside:
+    for value, allowed in outside.items():
         assert messages(kind, x=value) == {"x": f"{value} is out of range: allowed is {allowed}"}
 
 
@@ -147,7 +145,7 @@ def test_checked():
     assert f(1) == 3 and f(3, 4, c=1) == 8 and f.__doc__ == "Adds up."
     assert f(np.int64(2), c=np.float32(0.5)) == 4.5
     assert list(inspect.signature(f).parameters) == ["a", "b", "c"]
-    with pytest.raises(ValueError, match="^a: 0 is out of range: allowed is from 1 to 3$"):
+    with pytest.raises(ValueError, match="^a: 0 is out of range: allowed is at least 1$"):
         f(0)
     with pytest.raises(ValueError, match="^a: 4 is .*; c: 2 is out .* is at most 1$"):
         f(4, c=2)

@@ -33,8 +33,7 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
                 # inside a list, or an option of a union
                 while len(path) > 1 and ".".join(path) not in fields:
                     path.pop()
-                field = fields.get(".".join(path))
-                text = sentence(line, field, line["input"]) if field else line["msg"]
+                text = sentence(line)
             errors.setdefault(".".join(path) or "configuration", text)
         raise ConfigErrors(errors.items()) from None
     if conflicts := [*getattr(chosen, "conflicts", tuple)()]:

@@ -53,8 +53,7 @@ def wrapper_settings(item: "str | dict") -> Any:
         if key not in fields:
             hint = closest(key, fields.keys() - {"name"})
             raise ValueError(f"{label} has no setting {key!r}; {hint}") from None
-        text = sentence(line, fields[key], line["input"])
-        raise ValueError(f"{label}: {key}: {text}") from None
+        raise ValueError(f"{label}: {key}: {sentence(line)}") from None
 
 
 class Group(NamedTuple):

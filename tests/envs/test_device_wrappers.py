@@ -219,7 +219,7 @@ def test_rewards_are_scaled_clipped_and_shaped():
     [
         ("[frame_stak]", "'frame_stak' is not a wrapper; did you mean frame_stack?"),
         ("[time_limit]", "time_limit: n: is missing"),
-        ("[{name:time_limit,n:0}]", "time_limit: n: 0 is out of range: allowed is from 1"),
+        ("[{name:time_limit,n:0}]", "time_limit: n: 0 is out of range: allowed is at least 1"),
         ("[{name:frame_stack,m:3}]", "frame_stack has no setting 'm'; there are n, sensors"),
         ("[{name:drop_sensor,sensor:rgb}]", "there is no sensor 'rgb'; leave sensor out"),
         ("[{n:3}]", "a wrapper is a name or {name: ..., setting: ...}"),
