@@ -21,6 +21,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NamedTuple
 
+import annotated_types
 from docstrings import api, described, first_sentence, markdown
 from omegaconf import OmegaConf
 from pydantic import AfterValidator
@@ -33,7 +34,7 @@ from megastep.agents.errors import EXIT_CODES
 from megastep.agents.factory import check, components, settings
 from megastep.imports import import_object
 from megastep.schedules import Scheduled
-from megastep.settings import AtMost, allowed
+from megastep.settings import BOUNDS, AtMost
 
 #: The dataclasses of the scripts' settings.
 SCRIPTS = {"train": settings.Train, "evaluate": settings.Evaluate, "record": settings.Record}
@@ -182,10 +183,24 @@ def kind_of(field: FieldInfo) -> str:
         words = ["number", "schedule"]
     else:
         words = [_word(one, names) for one in options if one is not NoneType]
-    text, bounds = " or ".join(words), re.sub(r"\d+(,\d{3}){3,}", _power, allowed(field))
-    bounds = "" if bounds == "any finite number" else f", {bounds}"
+    text, bounds = " or ".join(words), re.sub(r"\d+(,\d{3}){3,}", _power, _bounds(field))
+    bounds = bounds and f", {bounds}"
     limits = [f", at most `{one.key}`" for one in field.metadata if isinstance(one, AtMost)]
     return text + bounds + "".join(limits)
+
+
+def _bounds(field):
+    """Returns the bounds of a number in words."""
+    extras = [*field.metadata]
+    for option in typing.get_args(field.annotation):  # of `X | None`
+        for extra in getattr(option, "__metadata__", ()):
+            extras += extra.metadata if isinstance(extra, FieldInfo) else [extra]
+    extras = [extra for extra in extras if isinstance(extra, annotated_types.BaseMetadata)]
+    bounds = {key: getattr(one, key, None) for one in extras for key in BOUNDS if hasattr(one, key)}
+    bounds = {key: bound for key, bound in bounds.items() if bound is not None}
+    words = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and below {:,}"}
+    words = words if len(bounds) == 2 else BOUNDS
+    return " ".join(words[key].format(bounds[key]) for key in BOUNDS if key in bounds)
 
 
 def _power(match):
