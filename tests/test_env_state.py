@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from megastep.capture import HostState
 from megastep.env_state import EnvState
-from megastep.host_state import HostState
 
 
 class Colour(enum.Enum):

@@ -12,9 +12,8 @@ from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import Actor
 from megastep.arrdict import arrdict
-from megastep.capture import capture
+from megastep.capture import HostState, capture
 from megastep.dotdict import leaves
-from megastep.host_state import HostState
 from megastep.types import Env, Tree, optional
 
 if TYPE_CHECKING:

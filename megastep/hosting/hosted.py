@@ -14,9 +14,16 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 
 from megastep.global_generators import KINDS, GlobalGenerators
 from megastep.hosting.env_error import BadValue, EnvError
-from megastep.hosting.probe import TRUE_RETURN, Probe, RewardRecorder, numbers_of
+from megastep.hosting.probe import (
+    TRUE_RETURN,
+    Probe,
+    RewardRecorder,
+    freeze,
+    load_wrapper_state,
+    numbers_of,
+    wrapper_state,
+)
 from megastep.hosting.values import CHECKED_STEPS, allowed_actions, problem
-from megastep.hosting.wrapper_state import freeze, load_wrapper_state, wrapper_state
 from megastep.types import Space, Tree
 
 __all__ = ["Hosted", "HostedEnvs", "make_env"]
