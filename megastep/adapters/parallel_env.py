@@ -9,8 +9,7 @@ import numpy as np
 import pettingzoo
 
 from megastep import arrdict
-from megastep.adapters.gymnasium_spaces import row
-from megastep.adapters.vector_env import VectorEnv
+from megastep.adapters.vector_env import VectorEnv, row
 from megastep.types import Env, Tree, optional
 
 __all__ = ["ParallelEnv"]

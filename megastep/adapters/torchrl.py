@@ -10,8 +10,8 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs import EnvBase
 
 from megastep import spaces
-from megastep.adapters.gymnasium_spaces import as_dtype, without_agents
 from megastep.adapters.lane_steps import Lanes, ended, fresh
+from megastep.adapters.vector_env import as_dtype, without_agents
 from megastep.types import Env, optional
 
 __all__ = ["TorchRLEnv"]
