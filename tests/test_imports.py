@@ -119,7 +119,7 @@ OWN_USERS = {
         "megastep/devices.py",
         "megastep/engine/*.py",
         "megastep/envs/*/*.py",
-        "megastep/geodesics/path_graph.py",
+        "megastep/geodesics/__init__.py",
         "megastep/kernels/build/*.py",
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
         "megastep/web/*.py",

@@ -13,7 +13,7 @@ from megastep.dotdict import dotdict
 from megastep.engine import AGENT_RADIUS
 from megastep.geodesics import PathGraph
 from megastep.geometries import checks, databases, homes
-from megastep.geometries.homes import partition, plan, portable_generator, regions
+from megastep.geometries.homes import plan, portable_generator, regions
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from scripts import check_homes, make_homes
 
@@ -63,7 +63,7 @@ def test_a_partition_covers_its_footprint_once(seed):
     for _ in range(60):
         rooms = plan.programme(7, generator)
         footprint = plan.footprint(sum(size for _, size in rooms), generator)
-        if result := partition.partition(footprint, rooms, generator, plan.style(1)):
+        if result := plan.partition(footprint, rooms, generator, plan.style(1)):
             placed, _ = result
             break
     assert sorted(room.kind for room in placed) == sorted(kind for kind, _ in rooms)

@@ -9,7 +9,7 @@ import numpy as np
 
 from megastep import geometry
 from megastep.dotdict import dotdict
-from megastep.geometries.homes import furniture, openings, partition, plan, walls
+from megastep.geometries.homes import furniture, plan, walls
 from megastep.geometries.homes.portable_generator import PortableGenerator
 
 ATTEMPTS = 60  # plans tried before a home gets one room less
@@ -26,19 +26,19 @@ def _attempt(count, generator, style) -> list[tuple]:
     """
     programme = plan.programme(count, generator)
     footprint = plan.footprint(sum(size for _, size in programme), generator)
-    result = partition.partition(footprint, programme, generator, style)
+    result = plan.partition(footprint, programme, generator, style)
     if not result:
         return []
     rooms, sides = result
     depth = walls.depths(sides, THIN[generator.below(len(THIN))])
-    meetings = openings.contacts(rooms)
-    spans = {contact: openings.clear(contact, meetings, depth) for contact in meetings}
-    result = openings.connections(rooms, spans, generator)
+    meetings = walls.contacts(rooms)
+    spans = {contact: walls.clear(contact, meetings, depth) for contact in meetings}
+    result = walls.connections(rooms, spans, generator)
     if not result:
         return []
     cost, connections = result
     gaps = [
-        openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), generator, style)
+        walls.draw_opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), generator, style)
         for c in connections
     ]
     return [(cost, footprint, rooms, meetings, depth, gaps)]
