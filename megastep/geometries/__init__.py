@@ -39,7 +39,6 @@ def sample(
 
     Raises:
         ValueError: for an unknown name, split or option, or a value that the source cannot use.
-        EngineError: if mazes do not fit into memory.
     """
     if name not in SOURCES:
         raise ValueError(f"Unknown geometry source {name!r}; {closest(name, SOURCES)}")

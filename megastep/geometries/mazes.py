@@ -24,34 +24,6 @@ COUNT = 5_000  # mazes per kind, of seeds 0 to 4,999; as many as homes
 MIN_CORRIDOR = 0.32
 START = 1_000  # mm; about where the lower-left corner is
 LIT = 3_000  # mm; a light is at most this walk, or two cells, from any cell
-# Memory per metre of wall (20 texels) while an environment is made. Explorer takes 1,540 on a CPU.
-BYTES_PER_METRE = 2_000
-
-
-def validate_lengths(size: int, corridor: float, thickness: float) -> tuple[int, int]:
-    """Returns (corridor, thickness) in mm, given in metres. Raises ValueError if the maze would be
-    too large, or a corridor too narrow.
-    """
-    if corridor < MIN_CORRIDOR:
-        raise ValueError(
-            f"corridor={corridor:g} m is too narrow for an agent: take at least {MIN_CORRIDOR:g}"
-        )
-    wide, thick = round(1000 * corridor), round(1000 * thickness)
-    reach = (START + size * (wide + thick)) / 1000 + 1  # rounding to cells adds less than a metre
-    if reach > geometry.MAX_EXTENT:
-        raise ValueError(
-            f"a maze of size={size}, corridor={corridor:g}, thickness={thickness:g} is too large: "
-            f"it reaches {reach:g} m, but the limit is {geometry.MAX_EXTENT:g} m"
-        )
-    return wide, thick
-
-
-def bytes_each(size: int, corridor: float, thickness: float) -> float:
-    """Returns the maximum memory of a maze: its masks, walls, and the scenery made of them."""
-    n_openings = 2 * size * (size - 1) if thickness > corridor else size * size - 1
-    metres = 4 * size * size * corridor + 2 * n_openings * (thickness - corridor)
-    pixels = (size * ((corridor + thickness) / geometry.RES + 1) + 15) ** 2
-    return BYTES_PER_METRE * metres + 2 * pixels
 
 
 def passages(size: int, braid: float, generator: PortableGenerator) -> list[list[int]]:
@@ -129,10 +101,16 @@ def generate(
     Walls are the faces that are visible from inside, each as long as it is straight. A cell of the
     masks is at most 0.2 m wide. One row or column of cells runs along the middle of each corridor,
     so the masks of corridors of any width are connected. Arguments are those of the source `maze`;
-    lengths are rounded to a millimetre. Raises ValueError, naming a length that is out of range.
+    lengths are rounded to a millimetre. Raises ValueError if the maze would be too large.
     """
-    wide, thick = validate_lengths(size, corridor, thickness)
+    wide, thick = round(1000 * corridor), round(1000 * thickness)
     pitch = wide + thick
+    reach = (START + size * pitch) / 1000 + 1  # rounding to cells adds less than a metre
+    if reach > geometry.MAX_EXTENT:
+        raise ValueError(
+            f"a maze of size={size}, corridor={corridor:g}, thickness={thickness:g} is too large: "
+            f"it reaches {reach:g} m, but the limit is {geometry.MAX_EXTENT:g} m"
+        )
     opened = passages(size, braid, PortableGenerator(seed))
     # wall and corridor lines alternate; row 0 is at the bottom
     grid = np.full((2 * size + 1, 2 * size + 1), WALL, np.int8)

@@ -8,7 +8,6 @@ openings, and dead ends are filled in. A seed gives the same bytes on every mach
 Cell (row, column) is floor if `floor[row, column]`; row 0 is at the bottom.
 """
 
-import numbers
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from megastep import geometry
 from megastep.dotdict import dotdict
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from megastep.geometries.homes.walls import INDOORS, WALL, segments
-from megastep.geometries.mazes import BYTES_PER_METRE, START, lit_cells
+from megastep.geometries.mazes import START, lit_cells
 
 COUNT = 5_000  # mazes per size, of seeds 0 to 4,999
 MIN_CELL = 0.5  # metres
@@ -42,23 +41,6 @@ KINDS = {
     13: Kind(objects=5, rooms=6, widest=5),
     15: Kind(objects=6, rooms=9, widest=3),
 }
-
-
-def validate(size: int, cell: float) -> int:
-    """Returns the side of a cell in mm. Raises ValueError for a wrong size or cell."""
-    if size not in KINDS:
-        raise ValueError(
-            f"size={size!r}: Memory Maze has mazes of {', '.join(map(str, KINDS))} cells"
-        )
-    if not isinstance(cell, numbers.Real) or not MIN_CELL <= cell <= 10:
-        raise ValueError(f"cell={cell!r} must be the side of a cell, from {MIN_CELL:g} to 10 m")
-    return round(1000 * cell)
-
-
-def bytes_each(size: int, cell: float) -> float:
-    """Returns the maximum memory of a maze: its masks, walls, and the scenery made of them."""
-    pixels = ((size + 2) * cell / geometry.RES + 15) ** 2
-    return BYTES_PER_METRE * 2 * size * size * cell + 2 * pixels
 
 
 def _rooms(size, generator) -> list[tuple[int, int, int, int]]:
@@ -147,10 +129,14 @@ def floor_plan(seed: int, size: int) -> tuple[np.ndarray, list[tuple[int, int, i
 
 def generate(seed: int, size: int = 9, cell: float = 0.6) -> dotdict:
     """Returns the maze of a seed: a geometry whose rooms are the maze's, without corridors. So
-    agents spawn in rooms. The size is one of `KINDS`, a cell is rounded to a millimetre. Raises
-    ValueError, naming the argument that is out of range.
+    agents spawn in rooms. A cell is rounded to a millimetre. Raises ValueError for a size that is
+    none of `KINDS`.
     """
-    side = validate(size, cell)
+    if size not in KINDS:
+        raise ValueError(
+            f"size={size!r}: Memory Maze has mazes of {', '.join(map(str, KINDS))} cells"
+        )
+    side = round(1000 * cell)
     floor, rooms = floor_plan(seed, size)
     lines = START + side * np.arange(size + 3)
     grid = np.full((size + 2, size + 2), WALL, np.int8)

@@ -138,14 +138,10 @@ def houseexpo(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[d
     return databases.pick("houseexpo", n, split, seed)
 
 
-def _generated(module, n, split, seed, n_bytes, size, **options) -> list[dotdict]:
-    """Returns mazes that a module generates, of `n_bytes` each."""
-    from megastep.devices import fit  # imports PyTorch, which reading settings must not
-
+def _generated(module, n, split, seed, **options) -> list[dotdict]:
+    """Returns mazes that a module generates."""
     indices = _draw(module.COUNT, n, split, seed)
-    unique = dict.fromkeys(indices)
-    fit(len(unique), n_bytes, "cpu", f"mazes of {size} x {size} cells")
-    generated = {i: module.generate(i, size, **options) for i in unique}
+    generated = {i: module.generate(i, **options) for i in dict.fromkeys(indices)}
     return [generated[i] for i in indices]
 
 
@@ -155,7 +151,7 @@ def maze(
     split: str = "training",
     seed: Seed = 1,
     size: Annotated[int, Field(ge=2, le=32)] = 8,
-    corridor: Annotated[float, Field(gt=0, le=100)] = 1.0,
+    corridor: Annotated[float, Field(ge=mazes.MIN_CORRIDOR, le=100)] = 1.0,
     thickness: Annotated[float, Field(ge=0.02, le=100)] = 0.2,
     braid: Annotated[float, Field(ge=0, le=1)] = 0.0,
 ) -> list[dotdict]:
@@ -164,14 +160,12 @@ def maze(
     Args:
         n, split, seed: how many are drawn, from which split, in which order.
         size: cells per side.
-        corridor: width of the corridors, in metres, at least 0.32, so that agents fit.
+        corridor: width of the corridors, in metres. An agent needs 0.32.
         thickness: thickness of the walls, in metres.
         braid: fraction of the dead ends that is opened: 0 leaves a perfect maze.
     """
-    mazes.validate_lengths(size, corridor, thickness)
-    n_bytes = mazes.bytes_each(size, corridor, thickness)
-    lengths = dict(corridor=corridor, thickness=thickness, braid=braid)
-    return _generated(mazes, n, split, seed, n_bytes, size=size, **lengths)
+    lengths = dict(corridor=corridor, thickness=thickness)
+    return _generated(mazes, n, split, seed, size=size, braid=braid, **lengths)
 
 
 @checked
@@ -180,18 +174,16 @@ def memory_maze(
     split: str = "training",
     seed: Seed = 1,
     size: Annotated[int, Field(ge=9, le=15)] = 9,
-    cell: Annotated[float, Field(gt=0, le=10)] = 0.6,
+    cell: Annotated[float, Field(ge=memory_mazes.MIN_CELL, le=10)] = 0.6,
 ) -> list[dotdict]:
     """Returns mazes of rooms and corridors, as those of Memory Maze, from 5,000 of each size.
 
     Args:
         n, split, seed: how many are drawn, from which split, in which order.
         size: cells per side: 9, 11, 13 or 15.
-        cell: side of a cell, in metres, at least 0.5.
+        cell: side of a cell, in metres.
     """
-    memory_mazes.validate(size, cell)
-    n_bytes = memory_mazes.bytes_each(size, cell)
-    return _generated(memory_mazes, n, split, seed, n_bytes, size=size, cell=cell)
+    return _generated(memory_mazes, n, split, seed, size=size, cell=cell)
 
 
 @checked
