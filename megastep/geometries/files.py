@@ -58,20 +58,6 @@ def _keys_of(archive) -> list[list[str]]:
     return [sorted(keys[index]) for index in range(len(keys))]
 
 
-def _read_geometry(archive, index, keys) -> dict:
-    g = dotdict()
-    for key in keys:
-        try:
-            g[key] = archive[f"{index}/{key}"]
-            if isinstance(g[key], bytes):
-                raise ValueError("has no magic string of an array")
-            if g[key].dtype.kind not in "fiub":
-                raise ValueError(f"is of dtype {g[key].dtype}, which is not a number")
-        except UNREADABLE as error:
-            raise ValueError(f"{key!r} cannot be read: {_clause(error)}") from error
-    return g
-
-
 def _sound(g, before) -> tuple[dict, float]:
     """Returns a validated geometry and the metres of its walls and those `before` it in a file."""
     g = geometry.validate_geometry(g)
@@ -84,11 +70,6 @@ def _sound(g, before) -> tuple[dict, float]:
     return g, before + length
 
 
-def _clause(error) -> str:
-    """The first line of an error's message, to be put into a sentence."""
-    return str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
-
-
 def load(path: str | Path) -> list[dotdict]:
     """Returns the list of geometries in an `.npz` file. Walls of length 0 are dropped.
 
@@ -99,18 +80,25 @@ def load(path: str | Path) -> list[dotdict]:
     path, place = Path(path), ""
     if not path.is_file():
         raise ValueError(f"There is no geometry file {str(path)!r}. Set path to an .npz file.")
+    geometries, length = [], 0.0
     try:
         if not zipfile.is_zipfile(path):
             raise ValueError("is no zip file, or is cut short")
         with np.load(path, allow_pickle=False) as archive:
-            geometries, length = [], 0.0
             for index, keys in enumerate(_keys_of(archive)):
+                place, g = f", geometry {index}", dotdict()
+                for key in keys:
+                    place = f", geometry {index}: {key!r} cannot be read"
+                    g[key] = np.asarray(archive[f"{index}/{key}"])
+                    if g[key].dtype.kind not in "fiub":
+                        raise ValueError(f"it has no magic string, or is of dtype {g[key].dtype}")
                 place = f", geometry {index}"
-                g, length = _sound(_read_geometry(archive, index, keys), length)
+                g, length = _sound(g, length)
                 geometries.append(g)
-            return geometries
     except UNREADABLE as error:
-        raise ValueError(f"Geometry file {str(path)!r}{place}: {_clause(error)}.") from error
+        clause = str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
+        raise ValueError(f"Geometry file {str(path)!r}{place}: {clause}.") from error
+    return geometries
 
 
 def save(path: str | Path, geometries: Sequence[dict]) -> None:
