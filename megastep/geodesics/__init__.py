@@ -126,13 +126,9 @@ class PathGraph:
         """Returns the corners where a disc fits and a path may turn around the end of a wall:
         columns (6, V) as in HomesParams, and the home of each, (V,) int32, ascending.
         """
-        ends, owner = walls.reshape(-1, 2), np.repeat(home, 2)
-        order = np.lexsort((*ends.T, owner))
-        ends, owner = ends[order], owner[order]
-        is_new = np.ones(len(ends), bool)
-        is_new[1:] = (ends[1:] != ends[:-1]).any(1) | (owner[1:] != owner[:-1])
-        ends, owner = ends[is_new], owner[is_new]
-
+        rows = np.column_stack([np.repeat(home, 2), walls.reshape(-1, 2)[:, ::-1]])
+        rows = np.unique(rows, axis=0)  # (home, y, x) of each end
+        owner, ends = rows[:, 0], rows[:, :0:-1]
         inradius, side = INFLATION * self.radius + 2 * SLACK, 2 * np.pi / SIDES
         angles = side * (np.arange(SIDES) + 0.5)
         # along the side before a corner and the one behind it, turned a little to the wall's end

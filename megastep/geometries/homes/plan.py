@@ -56,26 +56,29 @@ def style(density: float, clutter: float = 0.0) -> Style:
 
 
 class Kind(NamedTuple):
-    """A kind of room."""
+    """A kind of room. Those that are close in order tend to be neighbours: dry rooms at the ends,
+    entry and wet rooms in between.
+    """
 
     median: float  # of the area, m2
     sigma: float  # standard deviation of the area's logarithm
     width: int  # minimum clear width, cm
+    order: float
     weight: float = 0.0  # relative probability among rooms that are added
     aspect: float = 2.6  # maximum of long side / short side
 
 
 KINDS = {
-    "living": Kind(17.0, 0.30, 280),
-    "bath": Kind(3.1, 0.28, 115, 0.55),
-    "entry": Kind(5.0, 0.38, 115, aspect=4.6),
-    "bedroom": Kind(10.8, 0.18, 220, 1.0),
-    "kitchen": Kind(9.5, 0.40, 190),
-    "closet": Kind(2.2, 0.35, 90, 1.55),
-    "storage": Kind(2.7, 0.50, 90, 0.75),
-    "lobby": Kind(1.2, 0.25, 90, 0.45),
-    "utility": Kind(5.0, 0.50, 140, 0.45),
-    "room": Kind(10.0, 0.35, 220, 0.55),
+    "living": Kind(17.0, 0.30, 280, 0.0),
+    "bath": Kind(3.1, 0.28, 115, 2.8, 0.55),
+    "entry": Kind(5.0, 0.38, 115, 2.0, aspect=4.6),
+    "bedroom": Kind(10.8, 0.18, 220, 4.0, 1.0),
+    "kitchen": Kind(9.5, 0.40, 190, 1.0),
+    "closet": Kind(2.2, 0.35, 90, 3.6, 1.55),
+    "storage": Kind(2.7, 0.50, 90, 2.4, 0.75),
+    "lobby": Kind(1.2, 0.25, 90, 2.1, 0.45),
+    "utility": Kind(5.0, 0.50, 140, 2.6, 0.45),
+    "room": Kind(10.0, 0.35, 220, 1.2, 0.55),
 }
 # The first five rooms of every home.
 CORE = ("living", "bath", "entry", "bedroom", "kitchen")
@@ -185,21 +188,6 @@ STEPS = 40  # cuts tried for a whole partition
 MAX_CORRIDOR = 850  # cm of length
 CORRIDORS = 8.0  # relative probability of a corridor against a simple cut of its aspect
 
-# Rooms that are close in this order tend to be neighbours: dry rooms at the ends, entry and wet
-# rooms in between.
-ORDER = {
-    "living": 0.0,
-    "kitchen": 1.0,
-    "room": 1.2,
-    "entry": 2.0,
-    "lobby": 2.1,
-    "storage": 2.4,
-    "utility": 2.6,
-    "bath": 2.8,
-    "closet": 3.6,
-    "bedroom": 4.0,
-}
-
 
 class Room(NamedTuple):
     kind: str
@@ -226,8 +214,8 @@ def partition(
     Returns ([Room], {(axis, at): side}): the rooms, and for the line of each cut the side of it on
     which the wall stands; None if no partition is found in STEPS cuts.
     """
-    keyed = [(ORDER[kind] + generator.normal(0.0, 0.8), i) for i, (kind, _) in enumerate(rooms)]
-    ordered = [rooms[i] for _, i in sorted(keyed)]
+    keys = [KINDS[kind].order + generator.normal(0.0, 0.8) for kind, _ in rooms]
+    ordered = [rooms[i] for _, i in sorted(zip(keys, range(len(rooms))))]
     return _divide(region, ordered, generator, style.corridor, steps_left=[STEPS])
 
 
