@@ -23,7 +23,7 @@ imports = pytest.importorskip(
     "megastep.geometries.plans.imports", reason="needs the extra plans", exc_type=ImportError
 )
 safe, Options = imports.safe, imports.Options
-maps, outlines, shapely = imports.maps, imports.outlines, imports.shapely
+maps, outlines, shapely = imports.maps, imports.outlines, imports.outlines.shapely
 
 HOSTILE = Path(__file__).parents[1] / "data" / "hostile"
 EXPECTED = json.loads((HOSTILE / "EXPECTED.json").read_text())
@@ -557,6 +557,17 @@ def test_drawings_that_would_take_minutes_are_refused(shapes, words, monkeypatch
     monkeypatch.setattr(imports.svg, "MAX_WORK", 100_000)
     with pytest.raises(ValueError, match=words):
         imports.svg.read(SVG.format(shapes).encode(), 1.0)
+
+
+def test_a_file_that_takes_too_long_is_refused(monkeypatch):
+    """Though its lines do not cross: GEOS, which nothing interrupts, takes a minute to grow it."""
+    monkeypatch.setattr(imports, "SECONDS", 1)
+    teeth = "".join(f"L{1 + i / 500} {90 if i % 2 else 2}" for i in range(40_000))
+    comb = SVG.format(f'<rect width="9" height="9" id="wall-1"/><path id="wall" d="M1 1{teeth}z"/>')
+    path = Path("comb.svg")
+    monkeypatch.setattr(safe, "of_file", lambda *_: safe.Member(path.name, comb.encode()))
+    with pytest.raises(ValueError, match="it takes more than 1 s to read"):
+        imports.own_svg(path, 1.0)
 
 
 @pytest.mark.parametrize("path", sorted(STRANGERS.glob("*.yaml")), ids=lambda p: p.stem)

@@ -3,14 +3,17 @@
 import contextlib
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+import os
+import pickle
+import resource
+import warnings
+from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import loky
 import numpy as np
-import shapely
 
 from megastep import workers
 from megastep.dotdict import dotdict
@@ -18,15 +21,12 @@ from megastep.geometries import checks
 from megastep.geometries.plans import cubicasa, houseexpo, maps, outlines, safe, svg
 from megastep.geometries.plans.outlines import Drawing, Notes
 
+T = TypeVar("T")
 READERS = {"cubicasa": cubicasa, "houseexpo": houseexpo}
 BATCH = 16  # files that a process gets at a time
 AHEAD = 8 * BATCH  # files per process that are held at once
-#: What libraries raise for broken files, but for ValueError.
-UNREADABLE = (
-    *(shapely.errors.GEOSException, RecursionError, MemoryError, ArithmeticError, LookupError),
-    *(TypeError, AttributeError, AssertionError),
-)
 SHOWN = 12  # plans of the contact sheet
+SECONDS = 12  # of a core, for a file; real plans take up to one
 
 
 class Plan(NamedTuple):
@@ -49,48 +49,72 @@ class Options(NamedTuple):
 
 def _home(drawing, sealed=True, tolerance=outlines.CURVED) -> tuple[dotdict, Notes]:
     """Returns the geometry of a drawing, and notes. Raises ValueError if it is no home."""
-    with _refused():
-        g, notes = outlines.geometry_of(drawing, sealed, tolerance)
-        if (sentences := checks.errors(g)) and sealed:
-            raise ValueError("; ".join(sentences))
-        return g, notes
+    g, notes = outlines.geometry_of(drawing, sealed, tolerance)
+    if (sentences := checks.errors(g)) and sealed:
+        raise ValueError("; ".join(sentences))
+    return g, notes
 
 
-@contextlib.contextmanager
-def _refused() -> Iterator[None]:
-    """Turns whatever a stranger's file makes libraries raise into a ValueError of one line."""
-    try:
-        yield
-    except UNREADABLE as error:
-        raise ValueError(f"it cannot be read ({type(error).__name__}: {_line(error)})") from error
+def _limited(work: Callable[[], T]) -> T:
+    """Returns what `work` returns, in a process of its own, which ends after SECONDS of a core, as
+    nothing else ends work within GEOS. Raises ValueError then, and if `work` does.
+    """
+    reading, writing = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of threads, which it does not use
+        child = os.fork()
+    if child == 0:
+        try:
+            resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+            try:
+                result = (work(), "")
+            except Exception as error:  # whatever a stranger's file makes libraries raise
+                result = (None, _line(error))
+            with open(writing, "wb") as file:
+                pickle.dump(result, file)
+        finally:
+            os._exit(0)
+    os.close(writing)
+    with open(reading, "rb") as file:
+        content = file.read()
+    os.waitpid(child, 0)
+    if not content:
+        raise ValueError(f"it takes more than {SECONDS} s to read; leave out what is not a wall")
+    value, refusal = pickle.loads(content)
+    if refusal:
+        raise ValueError(refusal)
+    return value
 
 
 def _line(error) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__
+    text = " ".join(str(error).split())[:300]
+    is_ours = isinstance(error, ValueError)
+    return text if is_ours else f"it cannot be read ({type(error).__name__}: {text})"
 
 
 def read(options: Options, member: safe.Member) -> Plan:
     """Returns the plan of a file. A floor that is no home is a warning if another floor is one."""
-    name, reader = member.name, READERS[options.source]
-    if member.content is None:
-        return Plan(name, refusal=member.refusal)
-    homes, refusals = [], []
     try:
-        with _refused():
-            floors = reader.read(member.content, options.per)
+        return _limited(functools.partial(_read, options, member))
     except ValueError as error:
-        return Plan(name, refusal=_line(error))
-    for drawing in floors:
+        return Plan(member.name, refusal=str(error))
+
+
+def _read(options, member) -> Plan:
+    reader, homes, refusals = READERS[options.source], [], []
+    if member.content is None:
+        raise ValueError(member.refusal)
+    for drawing in reader.read(member.content, options.per):
         try:
             homes.append((*_home(drawing, options.sealed, reader.TOLERANCE), drawing))
-        except ValueError as error:
+        except Exception as error:
             refusals.append(_line(error))
     if not homes:
-        return Plan(name, refusal="; ".join(dict.fromkeys(refusals)))
+        raise ValueError("; ".join(dict.fromkeys(refusals)))
     geometries, notes, drawings = zip(*homes)
     if refusals:
         notes[0].warnings.append(f"{len(refusals)} floors are left out: {'; '.join(refusals)}")
-    return Plan(name, geometries, notes, drawings[0])
+    return Plan(member.name, geometries, notes, drawings[0])
 
 
 def run(
@@ -143,15 +167,22 @@ def own_svg(path: Path, scale: float, walls: str = "wall", doors: str = "door") 
     member = safe.of_file(path, path.name)
     if member.content is None:
         raise ValueError(member.refusal)
-    with _refused():
-        drawing, warnings = svg.read(member.content, scale, walls, doors)
-    g, notes = _home(drawing)
-    return Own(drawing, g, warnings + notes.warnings)
+    content = member.content
+
+    def work() -> Own:
+        drawing, warnings = svg.read(content, scale, walls, doors)
+        g, notes = _home(drawing)
+        return Own(drawing, g, warnings + notes.warnings)
+
+    return _limited(work)
 
 
 def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:
     """Returns the floor plan of a map. Arguments are those of `maps.load`. Raises ValueError."""
-    with _refused():
+
+    def work() -> Own:
         drawing, picture, warnings = maps.read(maps.load(path, metres_per_pixel))
-    g, notes = _home(drawing)
-    return Own(picture, g, warnings + notes.warnings)
+        g, notes = _home(drawing)
+        return Own(picture, g, warnings + notes.warnings)
+
+    return _limited(work)

@@ -121,6 +121,7 @@ def geometry_of(
     in the original megastep. Rooms that no agent can reach keep their walls; agents do not spawn
     in them. Raises ValueError.
     """
+    sealed = sealed or drawing.floor is not None  # a floor has no doors that lead outside
     shapes = [*drawing.walls, *drawing.rooms, *drawing.doors, *drawing.outdoors]
     n_corners = int(shapely.get_num_coordinates(shapes).sum())
     if n_corners > MAX_CORNERS:
