@@ -7,7 +7,7 @@ import subprocess
 import check_kernels
 import pytest
 
-from megastep.kernels.build import compile, headers
+from megastep.kernels.build import compile, kernel_library
 from megastep.kernels.build.launch import ENGINE
 
 LIBRARIES = {"/".join(one.folder.parts[-3:]): one for one in check_kernels.libraries()}
@@ -24,20 +24,25 @@ def compiled(folder, library, code):
     return ctypes.CDLL(str(binary))
 
 
+def is_number(kind):
+    return not issubclass(kind, (ctypes.Array, ctypes.Structure))
+
+
 @libraries
 def test_packed_structs_have_the_compilers_layout(library, tmp_path):
     """A compiler reads every field of every packed struct with the value that was packed."""
-    structs = headers.struct_fields(library.sources(".h"))
-    assert structs.keys() == vars(library.params).keys()
     names = [*filter(lambda name: "/" not in name, library.sources(".h"))]
-    declaring = [name for name in names if headers.STRUCT.search(library.sources(".h")[name])]
+    declaring = [
+        name for name in names if kernel_library.STRUCT.search(library.sources(".h")[name])
+    ]
     packed, code = {}, '#include "common/objects.h"\n'
     code += "".join(f'#include "{name}"\n' for name in declaring)
-    for name, fields in structs.items():
-        values = {field: position + 1 for position, (field, _) in enumerate(fields)}
-        values |= {field: bytes(int(kind[2:-1])) for field, kind in fields if kind[-1] == "s"}
-        packed[name] = getattr(library.params, name)(**values)
-        tests = [f"(long long)p->{f} == {values[f]}" for f, kind in fields if kind[-1] != "s"]
+    for name, layout in library.structs.items():
+        fields = dict(kernel_library._fields(layout))
+        values: dict = {field: position + 1 for position, field in enumerate(fields)}
+        whole = {f: bytes(ctypes.sizeof(kind)) for f, kind in fields.items() if not is_number(kind)}
+        packed[name] = getattr(library.params, name)(**values | whole)
+        tests = [f"(long long)p->{f} == {values[f]}" for f in fields.keys() - whole.keys()]
         tests.append(f"size == sizeof({name})")
         code += (
             f'extern "C" int check_{name}(const {name}* p, int size) '
@@ -70,13 +75,17 @@ struct OneParams {
     int first;
     NumbersParams one;
 };
+struct MoreParams : PointerParams {
+    int more;
+    const int* others;
+};
 """
 
 
 def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
     """Structs without a pointer have other sizes and places than those with one."""
-    structs = headers.struct_fields({"params.h": NESTED})
-    pack = {name: headers.builder(name, fields) for name, fields in structs.items()}
+    structs = kernel_library.structs({"params.h": NESTED})
+    pack = {name: kernel_library.packer(layout) for name, layout in structs.items()}
     numbers = [dict(count=i, size=i + 0.5, mask=2**31 + i) for i in range(2)]
     pointers = [dict(count=5 + i, values=2**40 + i, size=-i) for i in range(2)]
     numbers = [pack["NumbersParams"](fields) for fields in numbers]
@@ -85,6 +94,7 @@ def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
     packed = dict(
         ArraysParams=pack["ArraysParams"](dict(first=-1, second=-2, third=-3, **arrays)),
         OneParams=pack["OneParams"](dict(first=-1, one=numbers[1])),
+        MoreParams=pack["MoreParams"](dict(more=7, others=8, count=9, values=10, size=0.5)),
     )
     code = (
         NESTED
@@ -102,6 +112,10 @@ def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
     extern "C" int check_OneParams(const OneParams* p, int size) {
         return size == sizeof(*p) && p->first == -1 && p->one.count == 1 && p->one.size == 1.5f;
     }
+    extern "C" int check_MoreParams(const MoreParams* p, int size) {
+        return size == sizeof(*p) && p->more == 7 && (long long)p->others == 8 && p->count == 9 &&
+               (long long)p->values == 10 && p->size == 0.5f;
+    }
     """
     )
     checks = compiled(tmp_path, ENGINE, code)
@@ -110,7 +124,8 @@ def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
 
 
 def test_words_are_the_scalars_of_nested_structs_in_order():
-    words = headers.words({"params.h": NESTED})
+    structs = kernel_library.structs({"params.h": NESTED})
+    words = {name: [*kernel_library._words(layout)] for name, layout in structs.items()}
     assert words["OneParams"] == [
         ("first", "i", 0),
         *(("one.count", "i", 4), ("one.size", "f", 8), ("one.mask", "I", 12)),
@@ -142,47 +157,10 @@ def test_constants_have_the_compilers_values(library, tmp_path):
         assert read() == pytest.approx(number, rel=1e-7, abs=0), name
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "constexpr int N = 2 * 3;",
-        "constexpr int A = 1, B = 2;",
-        "constexpr int TWICE = 2;",
-        "constexpr int OCTAL = 010;",
-        "constexpr int HALF = 0.5;",
-        "static constexpr int N = 1;",
-        "const int N = 1;",
-        "#define N 1",
-        "constexpr int",
-    ],
-)
-def test_a_constant_that_cannot_be_read_is_named_with_its_line(line):
-    text = f"constexpr int TWICE = 1;\n/*\n*/ {line}\n"
-    message = rf"constants.h:3: cannot read '{re.escape(line)}'\. .*constexpr int MAX_RES"
-    with pytest.raises(ValueError, match=message):
-        headers.constants({"common/constants.h": text})
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "KERNEL drain(DrainParams p, int n) {",
-        "KERNEL drain(Drain p) {",
-        "KERNEL void drain(DrainParams p) {",
-        "static KERNEL drain(DrainParams p) {",
-        "KERNEL drain() {",
-        "KERNEL BOUNDS(MANY) drain(DrainParams p) {",
-    ],
-)
-def test_an_operation_that_cannot_be_read_is_named_with_its_line(line):
-    with pytest.raises(ValueError, match=rf"drain.cu:2: cannot read '{re.escape(line)}'.*KERNEL"):
-        headers.operations({"drain.cu": f"// KERNEL\n{line}\n}}\n"})
-
-
 @pytest.mark.parametrize("field", ["double x;", "float x, y;", "OtherParams other;", "int x[3];"])
 def test_a_field_that_cannot_be_packed_is_named(field):
     with pytest.raises(ValueError, match="params.h: .*" + re.escape(field[:-1])):
-        headers.struct_fields({"params.h": f"struct AParams {{\n    int a;\n    {field}\n}};\n"})
+        kernel_library.structs({"params.h": f"struct AParams {{\n    int a;\n    {field}\n}};\n"})
 
 
 def test_a_field_that_is_missing_or_unknown_is_named():

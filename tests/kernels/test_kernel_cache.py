@@ -11,8 +11,6 @@ import pytest
 from test_compile import ROOT, STEP, run
 
 from megastep import cache
-from megastep.kernels.build import compile
-from megastep.kernels.build.launch import ENGINE
 
 UNUSED = "the cache is not used"
 BODY = b"what was built " * 10_000
@@ -136,18 +134,3 @@ def test_folder_writable_by_others(fetch, mode, tmp_path):
     tmp_path.chmod(mode)
     with pytest.warns(UserWarning, match=f"{UNUSED}.*other users can write.*chmod 700"):
         assert fetch(tmp_path) == (BODY, None, 1)
-
-
-# ---- Signals ----
-
-
-@pytest.mark.parametrize(
-    "stop", ["kill -TERM $$", 'echo "c++: Killed signal terminated program cc1plus" >&2; exit 1']
-)
-def test_compiler_stopped_by_a_signal(stop, tmp_path):
-    stopped = tmp_path / "c++"
-    stopped.write_text(f"#!/bin/sh\n{stop}\n")
-    stopped.chmod(0o755)
-    with pytest.raises(compile.EngineError, match=r"stopped by a signal \((SIGTERM|Killed)\)") as e:
-        compile._build_cpu(ENGINE, str(stopped))
-    assert "install" not in str(e.value) and "\n" not in str(e.value)

@@ -11,9 +11,7 @@ import hashlib
 import json
 import os
 import platform
-import re
 import shutil
-import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -23,8 +21,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from megastep import cache
-from megastep.kernels.build import headers
-from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary
+from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary, operations
 
 if TYPE_CHECKING:
     from ctypes import CDLL
@@ -86,7 +83,7 @@ def compiler() -> tuple[str, str]:
     for command in [override] if override else ["c++", "g++", "clang++"]:
         path = shutil.which(command)
         if path:
-            return path, _run([path, "--version"]).stdout
+            return path, _run([path, "--version"])
     problem = (
         f"CXX={override} is not executable" if override else "c++, g++ and clang++ are missing"
     )
@@ -96,19 +93,16 @@ def compiler() -> tuple[str, str]:
     )
 
 
-def _run(command, **env) -> subprocess.CompletedProcess[str]:
-    """Runs a compiler in a new session, so that Ctrl-C reaches Python's handlers only."""
-    process = subprocess.run(
-        command, capture_output=True, text=True, start_new_session=True, env={**os.environ, **env}
-    )
-    by_driver = re.search(r"(\w+) signal terminated program", process.stderr)  # g++'s words
-    if process.returncode < 0 or by_driver:
-        name = by_driver[1] if by_driver else signal.Signals(-process.returncode).name
-        raise EngineError(
-            f"{command[0]} was stopped by a signal ({name}) while it built the CPU kernels: start "
-            f"again, and if nobody stopped it, free some memory first."
-        )
-    return process
+def _run(command, needs="", **env) -> str:
+    """Runs a compiler in a new session, so that Ctrl-C reaches Python's handlers only. Returns its
+    output. EngineError, with what it ``needs``, if it fails.
+    """
+    options: dict = dict(capture_output=True, text=True, start_new_session=True)
+    process = subprocess.run(command, env={**os.environ, **env}, **options)
+    if process.returncode:
+        output = " ".join(process.stderr.split())[:500]
+        raise EngineError(f"{command[0]} could not build {needs}. Its output: {output}")
+    return process.stdout
 
 
 def _processor() -> str:
@@ -121,25 +115,15 @@ def _processor() -> str:
 
 def _build_cpu(library, command) -> bytes:
     """Returns a shared library of all ``.cpp`` files."""
-    try:
-        with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
-            out, files = Path(folder) / "kernels.so", _cpu_sources(library, folder)
-            folders = f"-I{library.folder}", f"-I{KERNELS}"
-            process = _run(
-                [command, *library.cpu_flags, *folders, *files, "-o", str(out)], TMPDIR=folder
-            )
-            if not process.returncode:
-                return out.read_bytes()
-    except OSError as error:
-        raise EngineError(
-            f"The CPU kernels could not be built in {tempfile.gettempdir()} ({error.strerror}): "
-            f"make room there, or set TMPDIR to a folder that has some."
-        ) from None
-    raise EngineError(
-        f"{command} could not build the CPU kernels in {library.folder}; it needs C++17, OpenMP "
-        f"(Debian: apt install g++) and room in {tempfile.gettempdir()}. Its output: "
-        f"{' '.join(process.stderr.split())[:500]}"
+    needs = (
+        f"the CPU kernels in {library.folder}; it needs C++17, OpenMP (Debian: apt install g++), "
+        f"and room in memory and in {tempfile.gettempdir()}"
     )
+    with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
+        out, files = Path(folder) / "kernels.so", _cpu_sources(library, folder)
+        options = *library.cpu_flags, f"-I{library.folder}", f"-I{KERNELS}"
+        _run([command, *options, *files, "-o", str(out)], needs, TMPDIR=folder)
+        return out.read_bytes()
 
 
 def _load(name, body, path) -> "CDLL":
@@ -147,25 +131,21 @@ def _load(name, body, path) -> "CDLL":
     if path is not None:
         try:
             return ctypes.CDLL(str(path))
-        except OSError as error:
+        except OSError as error:  # of a mount that is noexec
             cache.warn(f"no library can be loaded from {path.parent} ({error})")
-    try:
-        with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
-            copy = Path(folder) / name
-            copy.write_bytes(body)
-            return ctypes.CDLL(str(copy))
-    except OSError as error:
-        raise EngineError(
-            f"The CPU kernels were built, but cannot be loaded from {tempfile.gettempdir()} "
-            f"({error}): set MEGASTEP_CACHE to a private folder with free space on a mount that is "
-            f"not noexec."
-        ) from None
+    with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
+        copy = Path(folder) / name
+        copy.write_bytes(body)
+        return ctypes.CDLL(str(copy))
 
 
 # ---- WebAssembly ----
 
 #: Name of the section of a module that holds {operation: the `wasm_key` of its library}.
 WASM_SECTION = "megastep"
+WASM_PACKAGES = (
+    " (Debian: apt install clang lld wasi-libc libc++-dev-wasm32 libclang-rt-dev-wasm32)"
+)
 
 
 def wasm_key(library: KernelLibrary) -> str:
@@ -175,16 +155,16 @@ def wasm_key(library: KernelLibrary) -> str:
 
 
 def wasm(
-    operations: Mapping[KernelLibrary, Sequence[str]], flags: tuple[str, ...] = WASM_FLAGS
+    libraries: Mapping[KernelLibrary, Sequence[str]], flags: tuple[str, ...] = WASM_FLAGS
 ) -> bytes:
     """Returns CPU operations of several libraries as one WebAssembly module, which imports nothing,
     and exports them, `malloc` and its memory. It computes the same bits as the CPU. EngineError if
     clang or its libraries for WebAssembly are missing, or cannot build them.
     """
     command, version = wasm_tools()
-    keys = {name: wasm_key(library) for library, names in operations.items() for name in names}
+    keys = {name: wasm_key(library) for library, names in libraries.items() for name in names}
     key = _key(json.dumps(keys), *flags, command, version)
-    return cache.fetch(f"wasm-{key}.wasm", lambda: _build_wasm(operations, command, flags, keys))[0]
+    return cache.fetch(f"wasm-{key}.wasm", lambda: _build_wasm(libraries, command, flags, keys))[0]
 
 
 def wasm_keys(module: bytes) -> dict[str, str]:
@@ -199,48 +179,35 @@ def wasm_tools() -> tuple[str, str]:
     for suffix in ("", *(f"-{version}" for version in range(14, 40))):
         path = shutil.which(f"clang++{suffix}")
         if path and any(map(shutil.which, (f"wasm-ld{suffix}", "wasm-ld"))):
-            return path, _run([path, "--version"]).stdout
+            return path, _run([path, "--version"])
     raise EngineError(
-        "Kernels for a browser are built by clang, and clang++ or wasm-ld is missing: install them "
-        "with WebAssembly's libraries (Debian: apt install clang lld wasi-libc libc++-dev-wasm32 "
-        "libclang-rt-dev-wasm32)."
+        f"Kernels for a browser are built by clang, and clang++ or wasm-ld is missing: install "
+        f"them with WebAssembly's libraries{WASM_PACKAGES}."
     )
 
 
-def _build_wasm(operations, command, flags, keys) -> bytes:
+def _build_wasm(libraries, command, flags, keys) -> bytes:
     linked = [f"-Wl,--export={name}" for name in ("malloc", *keys)]
+    needs = f"kernels for a browser; it needs lld and WebAssembly's libraries{WASM_PACKAGES}"
     with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
         objects = []
-        for i, library in enumerate(operations):
+        for i, library in enumerate(libraries):
             folders = f"-I{library.folder}", f"-I{KERNELS}"
             for source in _cpu_sources(library, folder):
                 objects.append(str(Path(folder) / f"{i}-{Path(source).name}.o"))
-                _run_clang([command, *flags, *folders, "-c", source, "-o", objects[-1]])
+                _run([command, *flags, *folders, "-c", source, "-o", objects[-1]], needs)
         out = Path(folder) / "kernels.wasm"
         # without -O: clang would have a wasm-opt that it finds change what it built
         options = "--target=wasm32-wasi", "-mexec-model=reactor", "-Wl,--strip-all"
-        _run_clang([command, *options, *linked, *objects, "-o", str(out)])
+        _run([command, *options, *linked, *objects, "-o", str(out)], needs)
         return out.read_bytes() + _section(WASM_SECTION.encode(), json.dumps(keys).encode())
 
 
 def _section(name: bytes, content: bytes) -> bytes:
     """Returns a custom section of a WebAssembly module."""
     content = bytes([len(name)]) + name + content
-    size, length = [], len(content)
-    while not size or length:  # seven bits a byte, the lowest first
-        size.append(length % 128 | (128 if length > 127 else 0))
-        length >>= 7
-    return bytes([0, *size]) + content
-
-
-def _run_clang(command) -> None:
-    process = _run(command)
-    if process.returncode:
-        raise EngineError(
-            f"{command[0]} could not build kernels for a browser; it needs lld and WebAssembly's "
-            f"libraries (Debian: apt install lld wasi-libc libc++-dev-wasm32 "
-            f"libclang-rt-dev-wasm32). Its output: {' '.join(process.stderr.split())[:500]}"
-        )
+    sevens = [len(content) >> shift & 127 for shift in (0, 7, 14, 21)]  # bits a byte, lowest first
+    return bytes([0, *(seven | 128 for seven in sevens[:3]), sevens[3]]) + content
 
 
 # ---- The GPU ----
@@ -337,11 +304,12 @@ def _build_cuda(files, flags) -> bytes:
 
 def joined(files: dict[str, str]) -> str:
     """Returns a source that includes every ``.cu`` file, and every header with an operation."""
-    return "".join(
-        f'#include "{name}"\n'
+    included = (
+        name
         for name, text in files.items()
-        if name.endswith(".cu") or headers.operations({name: text} if name.endswith(".h") else {})
+        if name.endswith(".cu") or name.endswith(".h") and operations({name: text})
     )
+    return "".join(f'#include "{name}"\n' for name in included)
 
 
 def _cpu_sources(library, folder) -> list[str]:

@@ -1,16 +1,26 @@
-"""A folder of kernels, compiled together for the CPU and for the GPU."""
+"""A folder of kernels, compiled together for the CPU and for the GPU, and what is read from its
+sources, so that structs, constants and operations are declared once:
 
-from collections.abc import Callable, Mapping
+* structs whose names end in ``Params``, one field per line: ``const float* positions;``, or an
+  array of such structs: ``LeafParams leaves[4];``. A struct may begin with the fields of another:
+  ``struct PongParams : StepParams {``
+* constants in files called ``constants.h``, one per line: ``constexpr int MAX_RES = 1024;``
+* operations, each at the start of a line: ``KERNEL render(RenderParams p)``; for a GPU,
+  ``INSTANCE(spawn, SpawnParams, ...)``; in a header, for CPU and GPU, ``EACH(uniform, ...)``
+"""
+
+import ctypes
+import re
+import struct
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property, partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
-
-from megastep.kernels.build import headers
+from typing import Any, NamedTuple
 
 __all__ = [
     *("CPU_FLAGS", "CUDA_FLAGS", "FAST_CUDA_FLAGS", "KERNELS", "SCALAR_WASM_FLAGS", "WASM_FLAGS"),
-    "KernelLibrary",
+    *("KernelLibrary", "Word", "operations"),
 ]
 
 #: The folder of the engine's kernels. Its headers in ``common/`` are for all kernel libraries.
@@ -36,6 +46,37 @@ CUDA_FLAGS = (
 #: NVRTC's flags where no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
 FAST_CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
 
+CONSTANT = re.compile(r"constexpr\s+(int|float)\s+(\w+)\s*=\s*(\S+?)f?;")
+STRUCT = re.compile(r"^struct (\w+Params)(?: : (\w+Params))? \{(.*?)^\};", re.M | re.S)
+FIELD = re.compile(r"(?:const )?([\w ]+?)\s*(\*?)\s*\b(\w+)(?:\[(\d+)\])?")
+OPERATION = re.compile(
+    r"^(?:KERNEL|(INSTANCE|EACH)\()\s*(?:BOUNDS\(\d+\) )?(\w+)(?:, |\((?:const )?)(\w+Params)\b"
+    r"(?:\s*&?\s*\w+\)\s*\{\s*(wait_for_previous\(\)\s*;)?)?",
+    re.M,
+)
+TYPES: dict[str, Any] = {"int": ctypes.c_int, "float": ctypes.c_float}
+TYPES["unsigned int"] = ctypes.c_uint
+#: The source of a function of {field: value} that packs a struct.
+PACKED = """
+def packed(values):
+    if len(values) == len(names):
+        try:
+            return pack({})
+        except KeyError:
+            pass
+    for field in sorted(names ^ values.keys()):
+        problem = "needs the field" if field in names else "has no field"
+        raise TypeError(f"{{name}} {{problem}} '{{field}}'")
+"""
+
+
+class Word(NamedTuple):
+    """A pointer or number of a struct."""
+
+    name: str  # of the field, such as `radius`, or `scenery.radius` in a struct that is a field
+    kind: str  # its format, of the module struct
+    offset: int  # in bytes, with pointers of this machine
+
 
 class KernelLibrary:
     """The kernels in one folder, which are built together when one is first launched.
@@ -44,7 +85,6 @@ class KernelLibrary:
     both as EACH in a header, which nothing else includes. Headers declare the struct of each
     launch; ``constants.h`` holds what the kernels share with Python. Sources include the folder's
     headers by name and the common ones as ``"common/errors.h"``.
-    :mod:`~megastep.kernels.build.headers` lists the declarations that are read from headers.
 
     Args:
         folder: where the sources are.
@@ -53,9 +93,15 @@ class KernelLibrary:
 
     Attributes:
         constants: {name: number} from ``constants.h``, the folder's and the common one.
-        params: a function for each struct; ``params.RowParams(n=64, ...)`` packs one that is a
-            field of another.
+        structs: {struct: its layout in memory}.
+        words: {struct: all its pointers and numbers}, those of structs that are fields too. Where
+            pointers take 4 bytes, as in WebAssembly, a struct is an array of them, 4 bytes each.
+        packers: {struct: function of {field: value} that packs one}.
+        params: the same by keywords; ``params.RowParams(n=64, ...)`` packs one that is a field of
+            another.
         cpu_operations, cuda_operations: {operation: struct} for the CPU and the GPU.
+        early_operations: those that a GPU may start before the previous kernel has ended: their
+            first statement, in each definition behind ``#if``, is ``wait_for_previous();``.
     """
 
     def __init__(
@@ -71,18 +117,23 @@ class KernelLibrary:
 
     @cached_property
     def constants(self) -> dict[str, Any]:
-        return headers.constants(self.sources(".h"))
+        files = (text for name, text in self.sources(".h").items() if name.endswith("constants.h"))
+        return {
+            name: int(number) if kind == "int" else float(number)
+            for kind, name, number in CONSTANT.findall("\n".join(map(_without_comments, files)))
+        }
 
     @cached_property
-    def words(self) -> dict[str, list[headers.Word]]:
-        """{struct: its pointers and numbers}."""
-        return headers.words(self.sources(".h"))
+    def structs(self) -> dict[str, type[ctypes.Structure]]:
+        return structs(self.sources(".h"))
+
+    @cached_property
+    def words(self) -> dict[str, list[Word]]:
+        return {name: [*_words(layout)] for name, layout in self.structs.items()}
 
     @cached_property
     def packers(self) -> dict[str, Callable[[Mapping[str, object]], bytes]]:
-        """{struct: function of {field: value} that packs one}."""
-        structs = headers.struct_fields(self.sources(".h"))
-        return {name: headers.builder(name, fields) for name, fields in structs.items()}
+        return {name: packer(layout) for name, layout in self.structs.items()}
 
     @cached_property
     def params(self) -> SimpleNamespace:
@@ -91,16 +142,17 @@ class KernelLibrary:
 
     @cached_property
     def cpu_operations(self) -> dict[str, str]:
-        return headers.operations(self.sources(".h", ".cpp"))
+        return operations(self.sources(".h", ".cpp"))
 
     @cached_property
     def cuda_operations(self) -> dict[str, str]:
-        return headers.operations(self.sources(".h", ".cu"))
+        return operations(self.sources(".h", ".cu"))
 
     @cached_property
     def early_operations(self) -> frozenset[str]:
-        """Those that a GPU may start before the previous kernel has ended."""
-        return headers.early_operations(self.sources(".h", ".cu"))
+        kernels = [*_kernels(self.sources(".h", ".cu"))]
+        late = {kernel[2] for kernel in kernels if not kernel[1] and not kernel[4]}
+        return frozenset(kernel[2] for kernel in kernels) - late
 
     def sources(self, *suffixes: str) -> dict[str, str]:
         """Returns the text of the files with these suffixes, by the name that includes them.
@@ -114,3 +166,83 @@ class KernelLibrary:
 
 def _pack(packer, /, **fields) -> bytes:
     return packer(fields)
+
+
+def operations(sources: Mapping[str, str]) -> dict[str, str]:
+    """Returns {operation: name of its struct} of what these sources {name: text} define."""
+    return {kernel[2]: kernel[3] for kernel in _kernels(sources)}
+
+
+def _kernels(sources) -> Iterator[re.Match[str]]:
+    for text in sources.values():
+        yield from OPERATION.finditer(_without_comments(text))
+
+
+def structs(sources: Mapping[str, str]) -> dict[str, type[ctypes.Structure]]:
+    """Returns every struct ``...Params`` in the headers ``sources`` {name: text}. Others that it
+    holds, or begins with, are declared before it. ValueError if a field cannot be packed.
+    """
+    found: dict[str, Any] = {}
+    for header, text in sources.items():
+        for name, base, body in STRUCT.findall(_without_comments(text)):
+            fields = [_field(line, header, found) for line in body.split(";")[:-1]]
+            parent = found[base] if base else ctypes.Structure
+            found[name] = type(name, (parent,), {"_fields_": fields})
+    return found
+
+
+def _field(line, header, known) -> tuple[str, Any]:
+    match = FIELD.fullmatch(line.strip())
+    of_name = ctypes.c_void_p if match and match[2] else None
+    of_name = of_name or match and (TYPES.get(match[1]) or known.get(match[1]))
+    if not match or not of_name or match[4] and match[1] not in known:
+        raise ValueError(
+            f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a pointer, "
+            f"an int, an unsigned int, a float, or a struct ...Params declared above or an array "
+            f"of them."
+        )
+    return match[3], of_name * int(match[4]) if match[4] else of_name
+
+
+def _fields(layout) -> list[tuple[str, Any]]:
+    """Returns [(name, type)] of a struct's fields, those that it begins with first."""
+    return [field for part in layout.__mro__[::-1] for field in vars(part).get("_fields_", ())]
+
+
+def _words(layout, title="", start=0) -> Iterator[Word]:
+    for name, kind in _fields(layout):
+        at = start + getattr(layout, name).offset
+        if issubclass(kind, ctypes.Array):
+            for k in range(kind._length_):
+                place = at + k * ctypes.sizeof(kind._type_)
+                yield from _words(kind._type_, f"{title}{name}.{k}.", place)
+        elif issubclass(kind, ctypes.Structure):
+            yield from _words(kind, f"{title}{name}.", at)
+        else:
+            yield Word(title + name, kind._type_, at)
+
+
+def packer(layout: type[ctypes.Structure]) -> Callable[[Mapping[str, object]], bytes]:
+    """Returns a function of {field: value} that packs a struct, or raises a TypeError unless it
+    gets each field, and no other. A pointer is a tensor, an address, or None for null. An array is
+    the joined bytes of its structs; those that are missing at its end are zeros.
+    """
+    address = "x if (x := values[{!r}]).__class__ is int else 0 if x is None else x.data_ptr()"
+    items, kinds, end = [], "", 0
+    for name, kind in _fields(layout):
+        at, size = getattr(layout, name).offset, ctypes.sizeof(kind)
+        character = (
+            f"{size}s" if issubclass(kind, (ctypes.Array, ctypes.Structure)) else kind._type_
+        )
+        items.append(address.format(name) if character == "P" else f"values[{name!r}]")
+        kinds += f"{at - end}x{character}"
+        end = at + size
+    pack = struct.Struct(f"{kinds}{ctypes.sizeof(layout) - end}x").pack
+    names = dict(_fields(layout)).keys()
+    scope: dict = dict(name=layout.__name__, names=names, pack=pack)
+    exec(PACKED.format(", ".join(items)), scope)  # a loop over the fields would slow launches down
+    return scope["packed"]
+
+
+def _without_comments(text) -> str:
+    return re.sub(r"//.*|/\*[\s\S]*?\*/", "", text)
