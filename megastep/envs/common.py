@@ -8,6 +8,10 @@ import torch
 from megastep import engine
 from megastep.arrdict import arrdict, numpyify
 from megastep.core import Core
+from megastep.engine.agents import check_on_cpu
+from megastep.engine.launch_params import world_params
+from megastep.kernels.build.kernel_library import KernelLibrary
+from megastep.kernels.build.launch import launch
 from megastep.modules import RandomSpawns
 from megastep.schedules import Number, Scheduled
 from megastep.types import Env
@@ -15,7 +19,7 @@ from megastep.types import Env
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["DisplayedEnv", "SceneryEnv", "Weight", "step_outputs", "world_of"]
+__all__ = ["DisplayedEnv", "SceneryEnv", "Weight", "judged", "step_outputs", "world_of"]
 
 FLAGS = "reset", "terminal", "truncated"
 
@@ -39,13 +43,45 @@ def step_outputs(env: Any, n_metrics: int, obs: Mapping, critic: Mapping) -> dic
     return outputs
 
 
-def world_of(outputs: Mapping, obs: Any, metrics: Sequence[str], **privileged: Any) -> arrdict:
-    """Returns the world of a step's outputs, with names of its metrics."""
+def judged(
+    env: Any,
+    library: KernelLibrary,
+    operation: str,
+    n_metrics: int,
+    obs: Mapping,
+    critic: Mapping,
+    n_threads: int | None = None,
+    **fields: Any,
+) -> dict[str, Any]:
+    """Launches the kernel of the step of a game in scenery, by default with a thread per lane.
+    Returns its :func:`step_outputs`; those of a critic are None unless ``env.privileged_space``.
+    """
+    core, n_lanes = env.core, env.n_envs * env.n_agents
+    is_wanted = env.privileged_space is not None
+    critic = {name: size * is_wanted for name, size in critic.items()}
+    outputs = step_outputs(env, n_metrics, obs, critic)
+    launch(
+        *(library, operation, env.device, n_threads or n_lanes),
+        **world_params(core.scenery, core.agents, "positions", "angles"),
+        ages=env.ages,
+        ended=env.ended,
+        **outputs,
+        **fields,
+    )
+    check_on_cpu(core.agents)
+    return outputs
+
+
+def world_of(outputs: Mapping, obs: Any, metrics: Sequence[str], **critic: str) -> arrdict:
+    """Returns the world of a step's outputs, with names of its metrics, and of what a critic sees:
+    {name: its output}.
+    """
     world = arrdict(obs=obs, **{name: outputs[name] for name in ("reward", *FLAGS)})
     if outputs["metrics"] is not None:
         world["metrics"] = arrdict(zip(metrics, outputs["metrics"].unbind()))
-    if privileged:
-        world["privileged"] = arrdict(privileged)
+    seen = {name: outputs[output] for name, output in critic.items()}
+    if any(tensor is not None for tensor in seen.values()):
+        world["privileged"] = arrdict(seen)
     return world
 
 

@@ -1,6 +1,7 @@
 // Irradiance: ambient light, and the light of each lamp that no wall of the layout occludes.
 #pragma once
 #include "common/math.h"
+#include "common/scenery.h"
 
 constexpr float AMBIENT = 0.1f;
 
@@ -38,4 +39,34 @@ HD void texel_centre(const float* line, int k, int width, float& x, float& y) {
     float u = ((float)k + 0.5f) / (float)width;
     x = mix(line[0], line[2], u);
     y = mix(line[1], line[3], u);
+}
+
+// Returns 1 if any of n walls occludes the light from a point at (dx, dy) from it.
+HD int is_occluded(const float* walls, int n, const float* light, float dx, float dy) {
+    for (int start = 0; start < n; start += SIMD_STEPS) {
+        int end = mini(start + SIMD_STEPS, n), occluded = 0;
+        SIMD_OR(occluded)
+        for (int j = start; j < end; j++) {
+            const float* wall = walls + 4 * j;
+            occluded |= occludes(
+                occluder_of(light[0], light[1], wall[0], wall[1], wall[2], wall[3]), dx, dy);
+        }
+        if (occluded)
+            return 1;
+    }
+    return 0;
+}
+
+// The light at a point of a layout.
+HD float light_at(const SceneryParams& s, int layout, float x, float y) {
+    float sum = AMBIENT;
+    int first_wall = s.wall_starts[layout], n_walls = s.wall_starts[layout + 1] - first_wall;
+    const float* walls = s.walls + 4 * (long long)first_wall;
+    for (int l = s.light_starts[layout]; l < s.light_starts[layout + 1]; l++) {
+        const float* light = s.lights + 3 * l;
+        float dx = x - light[0], dy = y - light[1];
+        if (!is_occluded(walls, n_walls, light, dx, dy))
+            sum += irradiance(light[2], dx, dy);
+    }
+    return minf(sum, 1.f);
 }

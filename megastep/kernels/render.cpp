@@ -357,7 +357,8 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
         if (a == 0)
             settle(p.objects, s, object, layout, env * p.objects.n_objects + k);
         draw_texel(p, object, env, k, scratch.objects.data());
-        for (int l = p.objects.line_starts[k]; l < p.objects.line_starts[k + 1]; l++)
+        Lines lines = lines_of(p.objects, k);
+        for (int l = lines.first; l < lines.end; l++)
             scratch.objects[l] = seen_line(p.objects, object, l, a);
     }
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;

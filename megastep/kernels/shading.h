@@ -54,7 +54,7 @@ HD Surface surface_of(const RenderParams& p, const EnvScenery& scenery, const Po
         int i = l - scenery.n_agent_lines;
         to_camera(camera, objects[i].x, objects[i].y, ax, ay);
         to_camera(camera, objects[i].z, objects[i].w, bx, by);
-        return {ax, ay, bx - ax, by - ay, p.objects.line_object[i], 1, OBJECTS};
+        return {ax, ay, bx - ax, by - ay, object_of(p.objects, i), 1, OBJECTS};
     }
     int is_agent = hit & AGENTS && l < scenery.n_agent_lines;
     int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(p, scenery));

@@ -9,13 +9,11 @@ from pydantic import Field
 from megastep import engine, spaces
 from megastep.arrdict import arrdict
 from megastep.dotdict import dotdict
-from megastep.engine.agents import check_on_cpu
-from megastep.engine.launch_params import world_params
 from megastep.engine.scenery import Scenery
-from megastep.envs.common import step_outputs, world_of
+from megastep.envs.common import judged, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.kernels.build.kernel_library import KernelLibrary
-from megastep.kernels.build.launch import WARP, launch
+from megastep.kernels.build.launch import WARP
 from megastep.modules import ENDLESS, TEXELS_PER_POINT, random_ages, visible_texels
 from megastep.settings import checked
 
@@ -147,30 +145,24 @@ class Explorer(FirstPerson):
         self.spawner(self.ended)
         view = self._view(seen=self.seen, clear_mask=self.ended[:, None])
         out = self._judge(view.newly_seen)
-        privileged = {name: out[name] for name in ("episode", "unseen") if out[name] is not None}
-        return world_of(out, images(view), ["coverage"], **privileged)
+        return world_of(out, images(view), ["coverage"], episode="episode", unseen="unseen")
 
     def _judge(self, newly_seen) -> dict:
         """Rewards agents for the texels (N, A) int32 that they have newly seen."""
-        core, is_wanted = self.core, self.privileged_space is not None
-        critic = dict(episode=N_EPISODE * is_wanted, unseen=N_BINS * is_wanted)
-        outputs, n_lanes = step_outputs(self, int(self.has_metrics), {}, critic), len(self.ended)
-        launch(
-            *(LIBRARY, "explorer_step", self.device, n_lanes * WARP if is_wanted else n_lanes),
-            **world_params(core.scenery, core.agents, "positions", "angles"),
+        runs, n_lanes = self.runs or NO_RUNS, len(self.ended)
+        return judged(
+            *(self, LIBRARY, "explorer_step", int(self.has_metrics)),
+            *({}, dict(episode=N_EPISODE, unseen=N_BINS)),
+            n_threads=n_lanes if self.privileged_space is None else n_lanes * WARP,
             newly_seen=newly_seen,
             seen=self.seen,
-            **(self.runs or NO_RUNS)._asdict(),
-            ages=self.ages,
+            **runs._asdict(),
+            n_runs=0 if runs.runs is None else len(runs.runs),
             limits=self.limits,
-            ended=self.ended,
-            **outputs,
             n_words=self.seen.shape[-1],
             patience=self.patience,
             texels_per_point=TEXELS_PER_POINT,
         )
-        check_on_cpu(core.agents)
-        return outputs
 
     @property
     def n_seen(self) -> torch.Tensor:

@@ -10,13 +10,11 @@ from megastep import modules, spaces
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.dotdict import dotdict
-from megastep.engine.agents import check_on_cpu
-from megastep.engine.launch_params import object_params, seed_params, world_params
-from megastep.envs.common import Weight, step_outputs, world_of
+from megastep.engine.launch_params import object_params, seed_params
+from megastep.envs.common import Weight, judged, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.envs.keys.episodes import cached_episodes
 from megastep.kernels.build.kernel_library import KernelLibrary
-from megastep.kernels.build.launch import launch
 from megastep.modules.lifecycle import derived_seed
 from megastep.modules.objects import REACH
 from megastep.settings import checked
@@ -116,25 +114,18 @@ class Keys(FirstPerson):
         self.spawner(self.ended)
         out = self._judge()
         obs = arrdict(images(self._view()), keys=out["keys_obs"])
-        critic = {} if out["privileged"] is None else dict(places=out["privileged"])
-        return world_of(out, obs, METRICS, **critic)
+        return world_of(out, obs, METRICS, places="privileged")
 
     def _judge(self) -> dict:
         """Has agents pick up keys, open doors and reach goals, before anything is rendered."""
-        core, n_colours = self.core, self.n_colours
-        n_privileged = 2 * n_colours + 3 if self.privileged_space is not None else 0
-        sizes = dict(keys_obs=n_colours), dict(privileged=n_privileged)
-        outputs = step_outputs(self, len(METRICS), *sizes)
-        launch(
-            *(LIBRARY, "keys_step", self.device, self.n_envs),
-            **world_params(core.scenery, core.agents, "positions", "angles"),
-            objects=object_params(core.scenery),
+        n_colours = self.n_colours
+        return judged(
+            *(self, LIBRARY, "keys_step", len(METRICS)),
+            *(dict(keys_obs=n_colours), dict(privileged=2 * n_colours + 3)),
+            objects=object_params(self.core.scenery),
             **self.tables,
             opened=self.opened,
             n_draws=self.n_draws,
-            ages=self.ages,
-            ended=self.ended,
-            **outputs,
             **seed_params(self.seed),
             n_episodes=N_EPISODES,
             n_colours=n_colours,
@@ -143,8 +134,6 @@ class Keys(FirstPerson):
             reach=REACH,
             **self.weights.tensors,
         )
-        check_on_cpu(core.agents)
-        return outputs
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""

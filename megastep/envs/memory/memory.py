@@ -11,12 +11,10 @@ from pydantic import Field
 from megastep import geometry, modules, spaces
 from megastep.arrdict import arrdict
 from megastep.dotdict import dotdict
-from megastep.engine.agents import check_on_cpu
-from megastep.engine.launch_params import object_params, seed_params, world_params
-from megastep.envs.common import step_outputs, world_of
+from megastep.engine.launch_params import object_params, seed_params
+from megastep.envs.common import judged, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.kernels.build.kernel_library import KernelLibrary
-from megastep.kernels.build.launch import launch
 from megastep.modules.lifecycle import derived_seed
 from megastep.modules.objects import REACH
 from megastep.modules.spawning import CLEARANCE, candidates, distances, per_geometry
@@ -148,32 +146,23 @@ class Memory(FirstPerson):
         self.spawner(self.ended)
         out = self._judge()
         obs = arrdict(images(self._view()), cue=out["cue_obs"])
-        critic = {} if out["goal"] is None else dict(goal=out["goal"], places=out["places"])
-        return world_of(out, obs, ["found"], **critic)
+        return world_of(out, obs, ["found"], goal="goal", places="places")
 
     def _judge(self) -> dict:
         """Rewards agents for objects that they touch, before anything is rendered."""
-        core, is_wanted = self.core, self.privileged_space is not None
-        critic = dict(goal=N_GOAL * is_wanted, places=2 * self.n_objects * is_wanted)
-        outputs = step_outputs(self, 1, dict(cue_obs=3), critic)
-        launch(
-            *(LIBRARY, "memory_step", self.device, self.n_envs),
-            **world_params(core.scenery, core.agents, "positions", "angles"),
-            objects=object_params(core.scenery),
+        return judged(
+            *(self, LIBRARY, "memory_step", 1),
+            *(dict(cue_obs=3), dict(goal=N_GOAL, places=2 * self.n_objects)),
+            objects=object_params(self.core.scenery),
             arrangements=self.arrangements,
             cue=self.cue,
             found=self.found,
             n_draws=self.n_draws,
-            ages=self.ages,
-            ended=self.ended,
-            **outputs,
             **seed_params(self.seed),
             n_arrangements=N_ARRANGEMENTS,
             limit=self.limit,
             reach=REACH,
         )
-        check_on_cpu(core.agents)
-        return outputs
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""

@@ -12,14 +12,12 @@ from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.dotdict import dotdict
 from megastep.engine import Resets
-from megastep.engine.agents import check_on_cpu
-from megastep.engine.launch_params import seed_params, world_params
-from megastep.envs.common import Weight, step_outputs, world_of
+from megastep.engine.launch_params import seed_params
+from megastep.envs.common import Weight, judged, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.envs.pointgoal.goals import goal_fields
 from megastep.geodesics import CELL
 from megastep.kernels.build.kernel_library import KernelLibrary
-from megastep.kernels.build.launch import launch
 from megastep.modules.lifecycle import derived_seed
 from megastep.settings import checked
 
@@ -107,29 +105,22 @@ class PointGoal(FirstPerson):
 
     def _world(self, free=None) -> arrdict:
         self.spawner(self.ended)
-        view = images(self._view())
         out = self._judge(free)
-        critic = {} if out["privileged"] is None else dict(way=out["privileged"])
-        return world_of(out, arrdict(view, goal=out["goal_obs"]), METRICS, **critic)
+        obs = arrdict(images(self._view()), goal=out["goal_obs"])
+        return world_of(out, obs, METRICS, way="privileged")
 
     def _judge(self, free) -> dict:
         """Rewards agents for getting closer to their goals, and draws those of new episodes."""
-        core, n_lanes = self.core, len(self.ended)
-        n_privileged = N_PRIVILEGED if self.privileged_space is not None else 0
-        sizes = dict(goal_obs=3), dict(privileged=n_privileged)
-        outputs = step_outputs(self, len(METRICS), *sizes)
-        launch(
-            *(LIBRARY, "pointgoal_step", self.device, n_lanes),
-            **world_params(core.scenery, core.agents, "positions", "angles"),
+        return judged(
+            *(self, LIBRARY, "pointgoal_step", len(METRICS)),
+            *(dict(goal_obs=3), dict(privileged=N_PRIVILEGED)),
             free=free,
             spawn_index=self.spawner.point_index,
             **self.goals._asdict(),
+            last=self.goals.fields[-1:],
             n_draws=self.n_draws,
             goal_index=self.goal_index,
-            ages=self.ages,
             progress=self.progress,
-            ended=self.ended,
-            **outputs,
             **seed_params(self.seed),
             per_cell=1 / CELL,
             reach=REACH,
@@ -138,8 +129,6 @@ class PointGoal(FirstPerson):
             n_goals=self.goals.points.shape[1],
             n_spawns=self.goals.lengths.shape[1],
         )
-        check_on_cpu(core.agents)
-        return outputs
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""

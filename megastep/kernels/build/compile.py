@@ -281,7 +281,7 @@ def _build_cuda(files, flags) -> bytes:
     """Returns a cubin of all ``.cu`` files.
 
     NVRTC gets every file under its own name, so its errors, ncu and compute-sanitizer name file and
-    line: physics_cuda.h:23.
+    line: physics.h:23.
     """
     _, nvrtc = bindings()
     names, texts = [name.encode() for name in files], [text.encode() for text in files.values()]

@@ -6,6 +6,7 @@
 //   ALIGNED, LOAD  16-byte records, and reading one in one instruction
 //   OR_BITS, ADD   update a word that other threads may update too
 //   COUNT_BITS     number of bits set
+//   SIMD_OR        before a loop of SIMD_STEPS that ORs into a word: compilers vectorise it
 //   HALF_BITS, HALF_VALUE          between float and fp16
 //   NAN_VALUE, INF_VALUE
 //   SQRT, CEIL, FLOOR, RINT        of a float, correctly rounded

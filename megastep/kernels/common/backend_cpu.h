@@ -24,6 +24,9 @@
 #define COUNT_BITS(word) __builtin_popcount(word)
 #define HALF_BITS(x) half_bits(x)
 #define HALF_VALUE(bits) half_value(bits)
+#define PRAGMA(words) _Pragma(#words)
+#define SIMD_OR(word) PRAGMA(omp simd reduction(| : word))
+#define SIMD_STEPS 64
 #define NAN_VALUE __builtin_nanf("")
 #define INF_VALUE __builtin_inff()
 

@@ -36,6 +36,8 @@
 #define COUNT_BITS(word) __popc(word)
 #define HALF_BITS(x) half_bits(x)
 #define HALF_VALUE(bits) half_value(bits)
+#define SIMD_OR(word)
+#define SIMD_STEPS 1
 #define NAN_VALUE __int_as_float(0x7fc00000)
 #define INF_VALUE __int_as_float(0x7f800000)
 

@@ -39,7 +39,8 @@ HD unsigned int cut_by_objects(const ObjectsParams& o, const Group& group, int e
         if (!is_obstacle(object))
             continue;
         Pose pose = pose_at(object.x, object.y, object.angle);
-        for (int l = o.line_starts[k]; l < o.line_starts[k + 1]; l++) {
+        Lines lines = lines_of(o, k);
+        for (int l = lines.first; l < lines.end; l++) {
             Float4 side = line_of(o, l, object, pose);
             for (int line = 0; line < 3; line++) {
                 float aside = (float)(line - 1);

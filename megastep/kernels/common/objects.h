@@ -39,6 +39,12 @@ struct ObjectsParams {
 
 HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
 
+// The object of an environment's line l; the first if its number is of none.
+HD int object_of(const ObjectsParams& o, int l) {
+    int k = o.line_object[l];
+    return (unsigned int)k < (unsigned int)o.n_objects ? k : 0;
+}
+
 HD void flag_object(const ObjectsParams& o, int i, int kind) {
     *o.error_flag = OBJECT_ERROR_KINDS * i + kind;
 }
@@ -59,6 +65,16 @@ HD Float4 line_at(const Float4& ends, float size, const Pose& pose) {
             pose.y + (pose.sine * ax + pose.cosine * ay),
             pose.x + (pose.cosine * bx + minus_sine * by),
             pose.y + (pose.sine * bx + pose.cosine * by)};
+}
+
+// The lines [first, end) of an environment's object k, within those that there are.
+struct Lines {
+    int first, end;
+};
+
+HD Lines lines_of(const ObjectsParams& o, int k) {
+    int end = o.line_starts[k + 1];
+    return {maxi(o.line_starts[k], 0), mini(end, o.n_lines)};
 }
 
 // Line l of an environment's objects, one of this object at a pose.

@@ -22,3 +22,14 @@ HD Philox philox(unsigned int lane, unsigned int draw, unsigned int key0, unsign
 
 // A number in [0, 1) from the upper 24 bits, which a float holds exactly.
 HD float unit_float(unsigned int bits) { return (float)(bits >> 8) * (1.f / 16777216.f); }
+
+// An integer in [0, n) from the same bits.
+HD int below(unsigned int bits, int n) { return (int)(unit_float(bits) * (float)n); }
+
+// A lane's next random bits, by the number of its draws so far, which it counts. That wraps, as the
+// counter does.
+HD Philox next_draw(int* counts, int lane, unsigned int key0, unsigned int key1) {
+    unsigned int draw = (unsigned int)counts[lane];
+    counts[lane] = (int)(draw + 1u);
+    return philox((unsigned int)lane, draw, key0, key1);
+}

@@ -32,13 +32,17 @@ struct SceneryParams {
     float reach;         // metres: at least the model's extent from its origin
 };
 
-// The layout that environment `env` shows. A layout that does not exist is flagged and read as 0.
-HD int layout_of(const SceneryParams& s, int env, int* error_flag) {
-    int layout = s.layout[env];
-    if ((unsigned int)layout < (unsigned int)s.n_layouts)
-        return layout;
-    flag_error(error_flag, env, BAD_LAYOUT);
+// `index` if it is in [0, n). Else it is flagged as an error of this kind, and read as 0.
+HD int checked(int index, int n, int* error_flag, int env, int kind) {
+    if ((unsigned int)index < (unsigned int)n)
+        return index;
+    flag_error(error_flag, env, kind);
     return 0;
+}
+
+// The layout that environment `env` shows.
+HD int layout_of(const SceneryParams& s, int env, int* error_flag) {
+    return checked(s.layout[env], s.n_layouts, error_flag, env, BAD_LAYOUT);
 }
 
 // CPU threads for n agents. Fewer than `min` take one thread less time than another takes to wake,

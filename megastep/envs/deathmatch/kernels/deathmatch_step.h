@@ -100,10 +100,7 @@ HD void finish_step(const DeathmatchStepParams& p, int first, int a, const Hits&
                    *p.death_cost * (float)dies + *p.aim_reward * gain_of_aim(p, i);
     if (p.newly_seen)
         reward += (float)p.newly_seen[i] * p.search_reward;
-    p.reward[i] = reset ? 0.f : reward;
-    p.reset[i] = (unsigned char)reset;
-    p.terminal[i] = (unsigned char)(ends && dies);
-    p.truncated[i] = (unsigned char)(ends && !dies);
+    write_outcome(p, i, reset ? 0.f : reward, reset, ends, dies);
     p.ended[i] = (unsigned char)ends;
     p.ages[i] = age;
     update_tally(p, i, kill, damage, hit, ends, dies);

@@ -2,8 +2,10 @@
 //
 // N environments, A agents per environment, M lines of the agent model.
 #pragma once
+#include "common/step.h"
 
-struct DeathmatchStepParams {
+// Metrics: kills, deaths, damage, accuracy.
+struct DeathmatchStepParams : OutcomeParams {
     const int* centre_line;  // (N, A) line at the centre of each view, as Render.indices
     const int* agent_ray;    // (N, A) ray closest to the centre that hits an agent, or -1
     const int* newly_seen;   // (N, A) texels seen for the first time; null: they earn nothing
@@ -14,12 +16,8 @@ struct DeathmatchStepParams {
     int* ages;               // (N, A) steps since the first observation
     int* round_ages;         // (N) steps of the round, -1: the next begins one; null: no rounds
     unsigned char* ended;    // (N, A) in: starts an episode in this step; out: ends it in this step
-    float* reward;           // (N, A) out, as the next six
-    unsigned char* reset;    // (N, A)
-    unsigned char* terminal;   // (N, A)
-    unsigned char* truncated;  // (N, A)
-    float* metrics;  // (4, N, A) kills, deaths, damage, accuracy where an episode ends; else 0
-    unsigned short* health_obs;  // (N, A, 3) fp16: health, whether it hit, how many hit it
+    unsigned short* health_obs;  // (N, A, 3) fp16, out, as the next two: health, whether it hit,
+                                 // how many hit it
     unsigned short* sound;  // (N, A, 3) fp16: loudness, cosine and sine of where from; null: none
     float* privileged;      // (N, A, 1 + PRIVILEGED_PER_OPPONENT (A - 1)) for a critic; null: none
     float damage;           // health that a hit costs its target

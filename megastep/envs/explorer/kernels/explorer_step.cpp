@@ -7,6 +7,7 @@ constexpr int BATCH = 64;  // runs
 static int count_left(const ExplorerStepParams& p, int agent, const Runs& runs, const Pose& pose,
                       int* bins) {
     const unsigned int* seen = seen_by(p, agent);
+    unsigned int last = p.n_words - 1;
     int n_left = 0;
     for (int first = runs.first; first < runs.end; first += BATCH) {
         int n = mini(BATCH, runs.end - first), counts[BATCH], bin[BATCH];
@@ -14,7 +15,7 @@ static int count_left(const ExplorerStepParams& p, int agent, const Runs& runs, 
         const unsigned int* words = (const unsigned int*)places;
 #pragma omp simd reduction(+ : n_left)
         for (int i = 0; i < n; i++) {
-            counts[i] = COUNT_BITS(words[4 * i + 3] & ~seen[words[4 * i + 2]]);
+            counts[i] = unseen_of(words[4 * i + 2], words[4 * i + 3], seen, last);
             n_left += counts[i];
         }
         if (!bins)

@@ -10,6 +10,7 @@ template <int binned>
 DEVICE int count_left(const ExplorerStepParams& p, int agent, const Runs& runs, const Pose& pose,
                       int warp_lane, int* bins) {
     const unsigned int* seen = seen_by(p, agent);
+    unsigned int last = p.n_words - 1;
     int n_left = 0;
 #pragma unroll 1
     for (int first = runs.first + warp_lane; first < runs.end; first += BATCH * WARP) {
@@ -23,7 +24,7 @@ DEVICE int count_left(const ExplorerStepParams& p, int agent, const Runs& runs, 
         }
 #pragma unroll
         for (int k = 0; k < BATCH; k++) {
-            counts[k] = run[k].bits ? COUNT_BITS(run[k].bits & ~seen[run[k].word]) : 0;
+            counts[k] = run[k].bits ? unseen_of(run[k].word, run[k].bits, seen, last) : 0;
             n_left += counts[k];
         }
 #pragma unroll

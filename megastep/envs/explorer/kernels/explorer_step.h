@@ -3,33 +3,21 @@
 // bins.h.
 #pragma once
 #include "bins.h"
-#include "common/errors.h"
-#include "common/scenery.h"
+#include "common/step.h"
 #include "constants.h"
 
 // N environments, A agents per environment, D layouts, S runs of texels of all layouts together.
-struct ExplorerStepParams {
-    SceneryParams scenery;
-    const float* positions;    // (N, A, 2)
-    const float* angles;       // (N, A)
+struct ExplorerStepParams : GameParams {
     const int* newly_seen;     // (N, A) texels newly marked in seen
     const unsigned int* seen;  // (N, A, n_words) a bit per static texel
-    const float* runs;         // (S, 4) see Run in explorer_step.h; null: nothing is counted
+    const float* runs;         // (S, 4) see Run below; null: nothing is counted
     const int* run_starts;     // (D + 1) first run of each layout
     const int* n_visible;      // (D) visible texels of each layout
-    int* ages;                 // (N, A) in and out, as the next two: steps since the first
-                               // observation
-    int* limits;               // (N, A) age at which the episode is truncated
-    unsigned char* ended;      // (N, A) in: starts an episode in this step; out: ends it here
-    int* error_flag;           // (1) out: see common/errors.h
-    float* reward;             // (N, A) out, as the next six
-    unsigned char* reset;      // (N, A)
-    unsigned char* terminal;   // (N, A)
-    unsigned char* truncated;  // (N, A)
-    float* metrics;            // (N, A) 0 where no episode ends; null: none
+    int* limits;               // (N, A) in and out: age at which the episode is truncated
     float* episode;            // (N, A, N_EPISODE) steps left and taken, texels seen and left
     float* unseen;             // (N, A, BINS) null: none, and no episode
     int n_words;
+    int n_runs;              // S
     int patience;            // steps that an episode lasts beside one per texel seen
     float texels_per_point;  // texels seen for the first time that earn a reward of 1
 };
@@ -41,13 +29,19 @@ struct ALIGNED Run {
     unsigned int word, bits;
 };
 
-// A layout's runs [first, end).
+// A layout's runs [first, end), within those that there are.
 struct Runs {
     int first, end;
 };
 
 HD Runs runs_of(const ExplorerStepParams& p, int layout) {
-    return {p.run_starts[layout], p.run_starts[layout + 1]};
+    return {maxi(p.run_starts[layout], 0), mini(p.run_starts[layout + 1], p.n_runs)};
+}
+
+// The texels of a run that an agent has not seen yet, of whose words `last` is the last.
+HD int unseen_of(unsigned int word, unsigned int bits, const unsigned int* seen,
+                 unsigned int last) {
+    return COUNT_BITS(bits & ~seen[word < last ? word : last]);
 }
 
 HD const unsigned int* seen_by(const ExplorerStepParams& p, int agent) {
@@ -80,13 +74,9 @@ HD Episode next(const ExplorerStepParams& p, const Episode& before) {
 HD int is_over(const Episode& episode) { return episode.age >= episode.limit; }
 
 HD void write_episode(const ExplorerStepParams& p, const Episode& episode, int agent) {
-    p.ages[agent] = episode.age;
+    float reward = episode.reset ? 0.f : (float)episode.newly_seen / p.texels_per_point;
     p.limits[agent] = episode.limit;
-    p.ended[agent] = (unsigned char)is_over(episode);
-    p.reward[agent] = episode.reset ? 0.f : (float)episode.newly_seen / p.texels_per_point;
-    p.reset[agent] = (unsigned char)episode.reset;
-    p.terminal[agent] = 0;
-    p.truncated[agent] = (unsigned char)is_over(episode);
+    write_outcome(p, agent, reward, episode.reset, episode.age, is_over(episode), 0);
 }
 
 // The fraction of the visible texels that an agent has seen, if its episode is over.

@@ -2,34 +2,23 @@
 // doors where one of the layout's episodes has them. The agent picks up keys and opens doors of
 // their colours by touching them.
 #pragma once
-#include "common/errors.h"
 #include "common/objects.h"
 #include "common/philox.h"
+#include "common/step.h"
 #include "constants.h"
-#include "common/scenery.h"
 
 // N environments of one agent, D layouts, M episodes per layout, C colours, K doorways. Objects are
-// C keys, the goal, then K doors.
-struct KeysStepParams {
-    SceneryParams scenery;
+// C keys, the goal, then K doors. Positions are written where an episode starts. Metrics: success,
+// doors opened, keys wasted.
+struct KeysStepParams : GameParams {
     ObjectsParams objects;
-    float* positions;          // (N, 1, 2) metres; out where an episode starts
-    const float* angles;       // (N, 1) degrees
     const float* starts;       // (D, M, 2) metres
     const float* keys;         // (D, M, C, 2) metres, NaN: no such key
     const float* goals;        // (D, M, 2) metres
     const int* doors;          // (D, M, K) OPEN, a colour, or C, which stays locked
     const float* doorways;     // (D, K, 4) x, y, degrees, half the length
-    int* opened;               // (N) in and out, as the next three: doors opened in this episode
+    int* opened;               // (N) in and out, as the next: doors opened in this episode
     int* n_draws;              // (N) numbers drawn so far, the generator's counter
-    int* ages;                 // (N) steps since the first observation
-    unsigned char* ended;      // (N) in: starts an episode in this step; out: ends it in this step
-    int* error_flag;           // (1) out: see common/errors.h
-    float* reward;             // (N) out, as the next six
-    unsigned char* reset;      // (N)
-    unsigned char* terminal;   // (N)
-    unsigned char* truncated;  // (N)
-    float* metrics;            // (N_METRICS, N) where an episode ends
     unsigned short* keys_obs;  // (N, C) fp16: 1 for each key that the agent carries
     float* privileged;         // (N, 2 C + 3) for a critic; null: none
     unsigned int key0;         // the seed
@@ -73,10 +62,8 @@ HD void put(Object& object, float x, float y, int colour, int visible) {
 }
 
 HD void start_episode(const KeysStepParams& p, int env, int layout) {
-    unsigned int draw = (unsigned int)p.n_draws[env];
-    p.n_draws[env] = (int)(draw + 1u);  // wraps, as Philox's counter does
-    Philox bits = philox((unsigned int)env, draw, p.key0, p.key1);
-    int drawn = (int)(unit_float(bits.a) * (float)p.n_episodes), n = p.n_colours;
+    Philox bits = next_draw(p.n_draws, env, p.key0, p.key1);
+    int drawn = below(bits.a, p.n_episodes), n = p.n_colours;
     long long row = (long long)layout * p.n_episodes + drawn;
     Object* things = things_of(p, env);
     p.positions[2 * env] = p.starts[2 * row];
@@ -148,12 +135,7 @@ HD void keys_env(const KeysStepParams& p, int env) {
         p.keys_obs[n * (long long)env + k] = HALF_BITS((float)held);
     }
     p.opened[env] = opened;
-    p.ages[env] = age;
-    p.ended[env] = (unsigned char)ends;
-    p.reward[env] = reward;
-    p.reset[env] = (unsigned char)reset;
-    p.terminal[env] = (unsigned char)(ends && success);
-    p.truncated[env] = (unsigned char)(ends && !success);
+    write_outcome(p, env, reward, reset, age, ends, success);
     long long rows = p.scenery.n_envs;
     p.metrics[env] = ends && success ? 1.f : 0.f;
     p.metrics[rows + env] = ends ? (float)opened : 0.f;

@@ -2,30 +2,18 @@
 // layout's arrangements has them. Rewards an agent that touches the object to find, and draws the
 // next.
 #pragma once
-#include "common/errors.h"
 #include "common/objects.h"
 #include "common/philox.h"
+#include "common/step.h"
 #include "constants.h"
-#include "common/scenery.h"
 
-// N environments of one agent, D layouts, O objects.
-struct MemoryStepParams {
-    SceneryParams scenery;
+// N environments of one agent, D layouts, O objects. Metric: objects found.
+struct MemoryStepParams : GameParams {
     ObjectsParams objects;
-    const float* positions;     // (N, 1, 2) metres
-    const float* angles;        // (N, 1) degrees
     const float* arrangements;  // (D, n_arrangements, O, 2) metres: where objects may lie
-    int* cue;                   // (N) in and out, as the next four: the object to find
+    int* cue;                   // (N) in and out, as the next two: the object to find
     int* found;                 // (N) objects found in this episode
     int* n_draws;               // (N) numbers drawn so far, the generator's counter
-    int* ages;                  // (N) steps since the first observation
-    unsigned char* ended;       // (N) in: starts an episode in this step; out: ends it in this step
-    int* error_flag;            // (1) out: see common/errors.h
-    float* reward;              // (N) out, as the next seven
-    unsigned char* reset;       // (N)
-    unsigned char* terminal;    // (N)
-    unsigned char* truncated;   // (N)
-    float* metrics;             // (N) objects found where an episode ends
     unsigned short* cue_obs;    // (N, 3) fp16: the colour of the object to find
     float* goal;                // (N, N_GOAL) for a critic, as the next; null: neither
     float* places;              // (N, O, 2) tens of metres ahead and to the left of the agent
@@ -35,9 +23,6 @@ struct MemoryStepParams {
     int limit;           // steps per episode
     float reach;         // metres between surfaces at which an agent touches an object
 };
-
-// An integer in [0, n), drawn by random bits.
-HD int below(unsigned int bits, int n) { return (int)(unit_float(bits) * (float)n); }
 
 // Returns 1 if the agent of an environment touches its object k.
 HD int touches(const MemoryStepParams& p, int env, int k) {
@@ -105,16 +90,12 @@ HD void memory_env(const MemoryStepParams& p, int env) {
     int reset = p.ended[env], cue = p.cue[env], hit = 0;
     flag_nonfinite(p.error_flag, env, p.positions[2 * env], p.positions[2 * env + 1],
                    p.angles[env]);
-    if (!reset && (unsigned int)cue >= (unsigned int)p.objects.n_objects) {
-        flag_error(p.error_flag, env, BAD_GOAL);
-        cue = 0;
-    }
-    if (!reset)
+    if (!reset) {
+        cue = checked(cue, p.objects.n_objects, p.error_flag, env, BAD_GOAL);
         hit = touches(p, env, cue);
+    }
     if (reset || hit) {
-        unsigned int draw = (unsigned int)p.n_draws[env];
-        p.n_draws[env] = (int)(draw + 1u);  // wraps, as Philox's counter does
-        Philox bits = philox((unsigned int)env, draw, p.key0, p.key1);
+        Philox bits = next_draw(p.n_draws, env, p.key0, p.key1);
         if (reset)
             arrange(p, env, layout_of(p.scenery, env, p.error_flag),
                     below(bits.b, p.n_arrangements));
@@ -124,12 +105,7 @@ HD void memory_env(const MemoryStepParams& p, int env) {
     int found = reset ? 0 : p.found[env] + hit;
     p.cue[env] = cue;
     p.found[env] = found;
-    p.ages[env] = age;
-    p.ended[env] = (unsigned char)ends;
-    p.reward[env] = (float)hit;
-    p.reset[env] = (unsigned char)reset;
-    p.terminal[env] = 0;
-    p.truncated[env] = (unsigned char)ends;
+    write_outcome(p, env, (float)hit, reset, age, ends, 0);
     p.metrics[env] = ends ? (float)found : 0.f;
     int colour = objects_of(p.objects)[env * p.objects.n_objects + cue].colour;
     colour = (unsigned int)colour < (unsigned int)p.objects.n_colours ? colour : 0;

@@ -1,37 +1,26 @@
 // One step of PointGoal. Computes an agent's distance and bearing to its goal, rewards, and where
 // episodes start and end. An agent that starts an episode draws a goal first.
 #pragma once
-#include "common/errors.h"
 #include "common/philox.h"
-#include "common/scenery.h"
+#include "common/step.h"
 #include "constants.h"
 
-// N environments, A agents per environment, D layouts.
-struct PointgoalStepParams {
-    SceneryParams scenery;
-    const float* positions;  // (N, A, 2)
-    const float* angles;     // (N, A)
+// N environments, A agents per environment, D layouts. Metrics: success, SPL, soft SPL, collisions.
+struct PointgoalStepParams : GameParams {
     const float* free;       // (N, A) fraction of the step that was free; null: no step was taken
     const int* spawn_index;  // (N, A) spawn point of the layout, where an episode starts
     const float* points;     // (D, n_goals, 2) the goals
     const unsigned short* fields;  // fp16, per layout (n_goals, height, width): metres to the goal
+    const unsigned short* last;    // (1) the last cell of all fields
     const long long* starts;       // (D) first cell of each layout's fields
     const int* shapes;             // (D, 2) height, width
     const float* origins;          // (D, 2) the centre of the first cell
     const float* lengths;          // (D, n_spawns, n_goals) of the shortest paths
-    const int* in_range;    // (D, n_spawns, n_goals) goals; those that may be drawn come first
-    const int* n_in_range;  // (D, n_spawns) number of goals that may be drawn
-    int* n_draws;           // (N, A) in and out, as the next four: numbers drawn so far
-    int* goal_index;        // (N, A) the agent's goal, of its layout's
-    float* progress;        // (PROGRESS_ROWS, N, A) see constants.h
-    int* ages;              // (N, A) steps since the first observation
-    unsigned char* ended;   // (N, A) in: starts an episode in this step; out: ends it in this step
-    int* error_flag;        // (1) out: see common/errors.h
-    float* reward;          // (N, A) out, as the next six
-    unsigned char* reset;   // (N, A)
-    unsigned char* terminal;   // (N, A)
-    unsigned char* truncated;  // (N, A)
-    float* metrics;            // (4, N, A) success, SPL, soft SPL, collisions where an episode ends
+    const int* in_range;       // (D, n_spawns, n_goals) goals; those that may be drawn come first
+    const int* n_in_range;     // (D, n_spawns) number of goals that may be drawn
+    int* n_draws;              // (N, A) in and out, as the next two: numbers drawn so far
+    int* goal_index;           // (N, A) the agent's goal, of its layout's
+    float* progress;           // (PROGRESS_ROWS, N, A) see constants.h
     unsigned short* goal_obs;  // (N, A, 3) fp16: distance / 10 m, cosine and sine of the bearing
     float* privileged;         // (N, A, N_PRIVILEGED) for a critic; null: none
     unsigned int key0;         // the seed
@@ -48,7 +37,8 @@ struct PointgoalStepParams {
 
 // Metres to a goal by the shortest path, at the centres of square cells.
 struct Field {
-    const unsigned short* cells;  // fp16
+    const unsigned short* cells;  // fp16, of all fields
+    long long first, last;        // of these, this field's first, and the last of all
     int height, width;
     float x, y;  // the centre of the first cell
 };
@@ -69,8 +59,11 @@ HD Reading read_field(const Field& f, float per_cell, float x, float y) {
                        right * up};
     float value[4], total = 0.f, weighted = 0.f, sum = 0.f;
     int n_known = 0;
+    long long at = f.first + (long long)row * f.width + column;
+    if (f.width < 1 || at < 0 || at + f.width + 1 > f.last)
+        return {INF_VALUE, 0.f, 0.f};
     for (int i = 0; i < 4; i++) {
-        value[i] = HALF_VALUE(f.cells[(long long)(row + i / 2) * f.width + column + i % 2]);
+        value[i] = HALF_VALUE(f.cells[at + (i / 2) * (long long)f.width + i % 2]);
         if (is_finite(value[i])) {
             weighted += weight[i] * value[i];
             total += weight[i];
@@ -87,23 +80,14 @@ HD Reading read_field(const Field& f, float per_cell, float x, float y) {
             mix(value[2] - value[0], value[3] - value[1], right) * per_cell};
 }
 
-// `index` if it is in [0, n), else 0 and an error flag.
-HD int checked_index(int index, int n, int* error_flag, int env) {
-    if ((unsigned int)index < (unsigned int)n)
-        return index;
-    flag_error(error_flag, env, BAD_GOAL);
-    return 0;
-}
-
 // Draws a goal within range of the spawn point. Returns the length of the shortest path to it.
 HD float draw_goal(const PointgoalStepParams& p, int agent, int env, int layout) {
-    unsigned int draw = (unsigned int)p.n_draws[agent];
-    p.n_draws[agent] = (int)(draw + 1u);  // wraps, as Philox's counter does
-    Philox bits = philox((unsigned int)agent, draw, p.key0, p.key1);
-    int spawn = checked_index(p.spawn_index[agent], p.n_spawns, p.error_flag, env);
+    Philox bits = next_draw(p.n_draws, agent, p.key0, p.key1);
+    int spawn = checked(p.spawn_index[agent], p.n_spawns, p.error_flag, env, BAD_GOAL);
     long long row = (long long)layout * p.n_spawns + spawn;
-    int column = (int)(unit_float(bits.a) * (float)p.n_in_range[row]);
+    int column = checked(below(bits.a, p.n_in_range[row]), p.n_goals, p.error_flag, env, BAD_GOAL);
     int goal = p.in_range[row * p.n_goals + column];
+    goal = checked(goal, p.n_goals, p.error_flag, env, BAD_GOAL);
     p.goal_index[agent] = goal;
     return p.lengths[row * p.n_goals + goal];
 }
@@ -139,7 +123,7 @@ HD void pointgoal_agent(const PointgoalStepParams& p, int agent) {
     if (reset)
         progress[SHORTEST * rows] = draw_goal(p, agent, env, layout);
 
-    int goal = checked_index(p.goal_index[agent], p.n_goals, p.error_flag, env);
+    int goal = checked(p.goal_index[agent], p.n_goals, p.error_flag, env, BAD_GOAL);
     const float* goal_at = p.points + 2 * ((long long)layout * p.n_goals + goal);
     float dx = goal_at[0] - x, dy = goal_at[1] - y, straight = SQRT(dx * dx + dy * dy);
     float ahead = pose.cosine * dx + pose.sine * dy, left = pose.cosine * dy - pose.sine * dx;
@@ -149,8 +133,13 @@ HD void pointgoal_agent(const PointgoalStepParams& p, int agent) {
     goal_obs[2] = HALF_BITS(straight > 0.f ? left / straight : 0.f);
 
     int height = p.shapes[2 * layout], width = p.shapes[2 * layout + 1];
-    Field field = {p.fields + p.starts[layout] + (long long)goal * height * width, height, width,
-                   p.origins[2 * layout], p.origins[2 * layout + 1]};
+    Field field = {p.fields,
+                   p.starts[layout] + (long long)goal * height * width,
+                   p.last - p.fields,
+                   height,
+                   width,
+                   p.origins[2 * layout],
+                   p.origins[2 * layout + 1]};
     Reading reading = read_field(field, p.per_cell, x, y);
     float before = progress[DISTANCE * rows];
     float distance = is_finite(reading.distance) ? reading.distance : before;
@@ -167,12 +156,8 @@ HD void pointgoal_agent(const PointgoalStepParams& p, int agent) {
     int age = reset ? 0 : p.ages[agent] + 1, success = straight <= p.reach;
     int ends = !reset && (success || age >= p.limit);
     float cost = *p.cost + *p.walk_cost * moved;
-    p.reward[agent] = reset ? 0.f : before - distance + (success ? *p.bonus : 0.f) - cost;
-    p.reset[agent] = (unsigned char)reset;
-    p.terminal[agent] = (unsigned char)(ends && success);
-    p.truncated[agent] = (unsigned char)(ends && !success);
-    p.ended[agent] = (unsigned char)ends;
-    p.ages[agent] = age;
+    float reward = reset ? 0.f : before - distance + (success ? *p.bonus : 0.f) - cost;
+    write_outcome(p, agent, reward, reset, age, ends, success);
     write_metrics(p, agent, n, ends, success);
     if (p.privileged) {
         float* privileged = p.privileged + N_PRIVILEGED * (long long)agent;

@@ -2,21 +2,16 @@
 // per cell, so nothing is rounded. Both sides observe the game as if they were the left one: the
 // right side sees it mirrored.
 #pragma once
-#include "common/errors.h"
 #include "common/philox.h"
+#include "common/step.h"
 #include "constants.h"
 
-// N games, B lanes: B = N sides.
-struct PongStepParams {
+// N games, B lanes: B = N sides. Metric: the fraction of a game's points.
+struct PongStepParams : OutcomeParams {
     int* games;                // (GAME_FIELDS, N) in and out: the fields of Game, in order
     const long long* actions;  // (B) 0 nothing, 1 up, 2 down; lane = env n_sides + side
-    float* reward;             // (B) out, as the next six
-    unsigned char* reset;      // (B)
-    unsigned char* terminal;   // (B)
-    unsigned char* truncated;  // (B)
-    float* metrics;            // (B) fraction of a game's points where it ends; 0 elsewhere
-    unsigned short* features;  // (B, N_FEATURES) fp16
-    unsigned char* pixels;     // (B, ROWS, COLUMNS)
+    unsigned short* features;  // (B, N_FEATURES) fp16, out, as the next; null: none
+    unsigned char* pixels;     // (B, ROWS, COLUMNS) null: none
     int* error_flag;           // (1) out: see common/errors.h
     unsigned int key0;         // the seed
     unsigned int key1;
@@ -123,14 +118,12 @@ HD int play(Game& g, const PongStepParams& p, int env) {
 }
 
 // Writes rewards and flags of an environment's lanes. `winner` is the side that won a point, or -1.
-HD void write_outcome(const PongStepParams& p, const Game& g, int env, int reset, int winner,
-                      int terminal) {
+HD void write_outcomes(const PongStepParams& p, const Game& g, int env, int reset, int winner,
+                       int terminal) {
     for (int side = 0; side < p.n_sides; side++) {
         int lane = env * p.n_sides + side, n_points = g.score[0] + g.score[1];
-        p.reward[lane] = winner < 0 ? 0.f : winner == side ? 1.f : -1.f;
-        p.reset[lane] = (unsigned char)reset;
-        p.terminal[lane] = (unsigned char)terminal;
-        p.truncated[lane] = (unsigned char)(g.ended && !terminal);
+        float reward = winner < 0 ? 0.f : winner == side ? 1.f : -1.f;
+        write_outcome(p, lane, reward, reset, g.ended, terminal);
         float metrics = 0.f;
         if (g.ended)
             metrics = n_points ? (float)g.score[side] / (float)n_points : 0.5f;
@@ -162,19 +155,21 @@ HD void write_features(const PongStepParams& p, const Game& g, int lane, int sid
     out[7] = HALF_BITS(offset(g, 1 - side));
 }
 
-// A side's image: the top rows of both paddles, and the pixels of the ball and its trail.
+// A side's image: the top rows of both paddles, and the pixels of the ball and its trail, all on
+// the court, whatever was written into `games`.
 struct Image {
     int own_top, other_top, ball, trail;
 };
 
 HD int pixel_at(int x, int y, int side) {
+    x = between(x, 0, WIDTH - 1);
     int column = (side ? WIDTH - 1 - x : x) / CELL;
-    return y / CELL * (WIDTH / CELL) + column;
+    return between(y, 0, HEIGHT - 1) / CELL * COLUMNS + column;
 }
 
 HD Image image_of(const Game& g, int side) {
-    return {g.top[side] / CELL, g.top[1 - side] / CELL, pixel_at(g.x, g.y, side),
-            pixel_at(g.last_x, g.last_y, side)};
+    int own = between(g.top[side], 0, MAX_TOP), other = between(g.top[1 - side], 0, MAX_TOP);
+    return {own / CELL, other / CELL, pixel_at(g.x, g.y, side), pixel_at(g.last_x, g.last_y, side)};
 }
 
 // One step, except for the image. Returns the game.
@@ -194,7 +189,7 @@ HD Game pong_env(const PongStepParams& p, int env) {
             serve(g, p, env);
     }
     store_game(g, p.games, p.n_envs, env);
-    write_outcome(p, g, env, reset, winner, terminal);
+    write_outcomes(p, g, env, reset, winner, terminal);
     if (p.features)
         for (int side = 0; side < p.n_sides; side++)
             write_features(p, g, env * p.n_sides + side, side);

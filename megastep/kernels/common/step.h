@@ -1,0 +1,38 @@
+// What the step of every game reads and writes.
+//
+// N environments, A agents per environment, B = N A lanes.
+#pragma once
+#include "common/scenery.h"
+
+struct OutcomeParams {
+    float* reward;             // (B) out, as the rest
+    unsigned char* reset;      // (B)
+    unsigned char* terminal;   // (B)
+    unsigned char* truncated;  // (B)
+    float* metrics;            // (n_metrics, B) of the episode where one ends, else 0
+};
+
+// Of a game in scenery.
+struct GameParams : OutcomeParams {
+    SceneryParams scenery;
+    float* positions;      // (N, A, 2) metres
+    const float* angles;   // (N, A) degrees
+    int* ages;             // (N, A) in and out: steps since the first observation
+    unsigned char* ended;  // (N, A) in: starts an episode in this step; out: ends it in this step
+    int* error_flag;       // (1) out: see common/errors.h
+};
+
+// Writes how lane i's step ends: the episode, if it `ends`, by the game's rule or by time.
+HD void write_outcome(const OutcomeParams& p, int i, float reward, int reset, int ends, int rule) {
+    p.reward[i] = reward;
+    p.reset[i] = (unsigned char)reset;
+    p.terminal[i] = (unsigned char)(ends && rule);
+    p.truncated[i] = (unsigned char)(ends && !rule);
+}
+
+HD void write_outcome(const GameParams& p, int i, float reward, int reset, int age, int ends,
+                      int rule) {
+    p.ages[i] = age;
+    p.ended[i] = (unsigned char)ends;
+    write_outcome(p, i, reward, reset, ends, rule);
+}
