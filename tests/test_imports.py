@@ -41,7 +41,7 @@ SIMULATOR = (
     ("adapters", "demo"),
 )
 ENGINE = (
-    ("checks", "state_tree", "views"),
+    ("checks", "state_tree"),
     ("objects", "resets"),
     ("agents", "scenery"),
     ("launch_params",),
@@ -405,7 +405,7 @@ def test_tests_and_scripts_import_megastep_agents():
 
 
 PLANTED = [
-    (simulator_rows, "megastep.engine.views", "megastep.geometries.toys"),
+    (simulator_rows, "megastep.engine.scenery", "megastep.geometries.toys"),
     (engine_rows, "megastep.engine.checks", "megastep.engine.agents"),
     (agents_rows, "megastep.agents.networks.policy", "megastep.agents.storage.rollout"),
     (simulator_knows_no_learner, "megastep.envs.minimal", "megastep.agents.networks.heads"),

@@ -101,8 +101,8 @@ def check(agents: Agents) -> None:
     """
     check_flag(checks.instance("agents", agents, Agents).error_flag)
     checked = vars(agents).get("_checked")  # the scenery that the agents were last in
-    if checked and checked.scenery.objects:
-        check_objects(checked.scenery.objects)
+    if checked and checked.key.objects:
+        check_objects(checked.key.objects)
 
 
 def check_flag(error_flag: torch.Tensor) -> None:

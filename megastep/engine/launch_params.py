@@ -1,5 +1,8 @@
 """The fields that many launches share: tensors' addresses, checked without synchronisation."""
 
+import ctypes
+from typing import Any
+
 import torch
 
 from megastep import devices
@@ -13,15 +16,23 @@ _address = torch.Tensor.data_ptr
 _STATE = dict(positions=(2,), angles=(), velocity=(2,), angvelocity=())
 
 
-class _Packed:
-    """A packed struct, and the addresses and numbers that it was packed with. Without a
-    ``__dict__``, so that checkpoints and :mod:`~megastep.engine.state_tree` do not look inside.
+class _Cached:
+    """What was last computed from a key. Without a ``__dict__``, so that checkpoints and
+    :mod:`~megastep.engine.state_tree` do not look inside.
     """
 
-    __slots__ = ("key", "params")
+    __slots__ = ("key", "value")
 
-    def __init__(self, key: tuple, params: bytes):
-        self.key, self.params = key, params
+    def __init__(self, key: Any, value: Any):
+        self.key, self.value = key, value
+
+
+def _cached(owner, key, pack) -> bytes:
+    """Returns the struct that ``pack()`` returns, again only if the key is another."""
+    cached = vars(owner).get("_packed")
+    if cached is None or cached.key != key:
+        cached = vars(owner)["_packed"] = _Cached(key, pack())
+    return cached.value
 
 
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
@@ -29,11 +40,7 @@ def scenery_params(scenery: Scenery, radius: float) -> bytes:
     n_threads = devices.threads()
     # a copy's tensors lie elsewhere
     key = _address(scenery.layout), _address(scenery.layouts.texels), radius, n_threads
-    packed = vars(scenery).get("_packed")
-    if packed is None or packed.key != key:
-        packed = _Packed(key, _pack_scenery(scenery, radius, n_threads))
-        vars(scenery)["_packed"] = packed
-    return packed.params
+    return _cached(scenery, key, lambda: _pack_scenery(scenery, radius, n_threads))
 
 
 def _pack_scenery(scenery, radius, n_threads) -> bytes:
@@ -64,11 +71,7 @@ def _pack_scenery(scenery, radius, n_threads) -> bytes:
     )
 
 
-_FIELDS = [
-    *("shapes", "line_starts", "line_object", "palette", "extents", "objects", "lines", "texels"),
-    *("error_flag", "n_objects", "n_lines", "n_colours", "lit", "ends"),
-]
-_NO_OBJECTS = ENGINE.params.ObjectsParams(**dict.fromkeys(_FIELDS, 0))
+_NO_OBJECTS = bytes(ctypes.sizeof(ENGINE.structs["ObjectsParams"]))
 
 
 def object_params(scenery: Scenery) -> bytes:
@@ -76,37 +79,19 @@ def object_params(scenery: Scenery) -> bytes:
     o = scenery.objects
     if o is None:
         return _NO_OBJECTS
-    key, packed = (_address(o.records), _address(o.palette)), vars(o).get("_packed")
-    if packed is None or packed.key != key:
-        struct = ENGINE.params.ObjectsParams(
-            shapes=o.shapes,
-            line_starts=o.line_starts,
-            line_object=o.line_object,
-            palette=o.palette,
-            extents=scenery.layouts.extents,
-            objects=o.records,
-            lines=o.lines,
-            texels=o.texels,
-            error_flag=o.error_flag,
-            n_objects=o.n_objects,
-            n_lines=len(o.line_object),
-            n_colours=o.n_colours,
-            lit=int(o.lit),
-            ends=o.ends,
-        )
-        packed = vars(o)["_packed"] = _Packed(key, struct)
-    return packed.params
+    key = _address(o.records), _address(o.palette)
+    return _cached(o, key, lambda: _pack_objects(o, scenery.layouts.extents))
 
 
-class _Checked:
-    """The agents' tensors that were last checked for a scenery: {name: (tensor, address)}. Without
-    a ``__dict__``, as :class:`_Packed`.
-    """
-
-    __slots__ = ("scenery", "tensors")
-
-    def __init__(self, scenery: Scenery):
-        self.scenery, self.tensors = scenery, {}
+def _pack_objects(o, extents) -> bytes:
+    tensors = "shapes", "line_starts", "line_object", "palette", "lines", "texels", "ends"
+    return ENGINE.params.ObjectsParams(
+        **{name: getattr(o, name) for name in (*tensors, "error_flag", "n_objects", "n_colours")},
+        extents=extents,
+        objects=o.records,
+        n_lines=len(o.line_object),
+        lit=int(o.lit),
+    )
 
 
 def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int]:
@@ -114,17 +99,17 @@ def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int
     another one than in the last call, or has moved: TypeError or ValueError name it.
     """
     tensors = vars(agents)
-    checked = tensors.get("_checked")
-    if checked is None or checked.scenery is not scenery:
-        checked = tensors["_checked"] = _Checked(scenery)
+    checked = tensors.get("_checked")  # {name: (tensor, address)} for a scenery
+    if checked is None or checked.key is not scenery:
+        checked = tensors["_checked"] = _Cached(scenery, {})
     addresses = {}
     for name in names:
-        tensor, (last, address) = tensors[name], checked.tensors.get(name, (checked, 0))
+        tensor, (last, address) = tensors[name], checked.value.get(name, (checked, 0))
         if tensor is not last or _address(tensor) != address:
             shape = (scenery.n_envs, scenery.n_agents, *_STATE[name])
             title, device = f"agents.{name}", scenery.device
             address = checks.address(title, tensor, shape, torch.float32, device)
-            checked.tensors[name] = tensor, address
+            checked.value[name] = tensor, address
         addresses[name] = address
     return addresses
 

@@ -8,12 +8,13 @@ N environments, D layouts, A agents per environment, M lines of the agent model,
 environment's agents, W walls and T texels of all layouts.
 """
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from megastep.engine import checks, views
+from megastep.engine import checks
 from megastep.engine.objects import Objects
 from megastep.kernels.build.launch import ENGINE
 from megastep.ragged import Ragged, RaggedTorch
@@ -173,24 +174,29 @@ class Scenery(SetOnce):
     @property
     def lines(self) -> RaggedTorch:
         """The lines (l, 2, 2) of each environment, agents' first, as last rendered. Read-only."""
-        return views.lines(self)
+        cure = ", and call bake; agents' lines follow agents.positions at each render"
+        return self._joined("lines", cure, lambda part: (part.lines, len(part.lines)))
 
     @property
     def lights(self) -> RaggedTorch:
         """The lights (l, 3) of each environment. Read-only."""
-        return views.lights(self)
+        return self._joined(
+            "lights", ", and call bake", lambda part: (part.lights, len(part.lights))
+        )
 
     @property
     def textures(self) -> RaggedTorch:
         """The texels (w, 3) of each line of all environments, of line l of environment e at index
         ``lines.starts[e] + l``. Read-only.
         """
-        return views.textures(self)
+        cure = "; agents' are in scenery.layouts.agent_textures"
+        return self._joined("textures", cure, lambda part: (part.texels[:, :3], part.widths))
 
     @property
     def baked(self) -> RaggedTorch:
         """The light (w,) on each line of all environments, indexed as ``textures``. Read-only."""
-        return views.baked(self)
+        cure = "; agents' light is computed at each render"
+        return self._joined("baked", cure, lambda part: (part.texels[:, 3], part.widths))
 
     def env(self, e: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...], torch.Tensor]:
         """Returns copies of one environment's lines (l, 2, 2), agents' first, then objects', then
@@ -198,31 +204,55 @@ class Scenery(SetOnce):
         environments there are.
         """
         e = checks.integer("e", e, -self.n_envs, self.n_envs - 1)
-        layouts, d = self.layouts, int(self.layout[e])
-        moving, of_objects = [self.agent_lines[e]], ()
-        if self.objects is not None:
-            moving.append(self.objects.lines[e])
-            lit = self.objects.texels[e, self.objects.line_object.long()]
-            of_objects = (lit[:, :3] * lit[:, 3:]).split(1)
+        part = self._part(e, int(self.layout[e]))
+        lit = part.texels[:, :3] * part.texels[:, 3:]
+        return part.lines, lit.split(part.widths.tolist()), part.lights.clone()
+
+    def _part(self, e, d) -> "_Part":
+        layouts, objects = self.layouts, self.objects
         first, last = layouts.wall_starts[d : d + 2].tolist()
-        bounds = layouts.texel_starts[first : last + 1].tolist()
-        model_bounds = self.model_texels.tolist()
-        agents = layouts.agent_textures[d] * self.agent_light[e, :, None]
-        texels = layouts.texels[bounds[0] : bounds[-1]]
-        walls = texels[:, :3] * texels[:, 3:]
-        lines = torch.cat([*moving, layouts.lines.vals[first:last]])
-        lights = layouts.lights.vals[slice(*layouts.light_starts[d : d + 2].tolist())]
-        lit = *agents.split(_widths(model_bounds)), *of_objects, *walls.split(_widths(bounds))
-        return lines, lit, lights.clone()
+        bounds = layouts.texel_starts[first : last + 1]
+        begin, end = bounds[[0, -1]].tolist()
+        light = self.agent_light[e, :, None]
+        lines, widths = [self.agent_lines[e]], [self.model_texels.diff()]
+        texels = [torch.cat([layouts.agent_textures[d], light], 1)]
+        if objects is not None:
+            lines.append(objects.lines[e])
+            texels.append(objects.texels[e, objects.line_object.long()])
+            widths.append(torch.ones_like(objects.line_object))
+        return _Part(
+            torch.cat([*lines, layouts.lines.vals[first:last]]),
+            torch.cat([*texels, layouts.texels[begin:end]]),
+            torch.cat([*widths, bounds.diff()]),
+            layouts.lights.vals[slice(*layouts.light_starts[d : d + 2].tolist())],
+        )
+
+    def _joined(self, name: str, cure: str, pick: "Callable[[_Part], tuple]") -> RaggedTorch:
+        """Returns a read-only copy of what ``pick`` takes of each environment, values and widths.
+        ``cure``: more words for errors.
+        """
+        refusal = (
+            f"scenery.{name} is a read-only copy: write into scenery.layouts.{name}, which reaches "
+            f"every environment that shows the layout{cure}"
+        )
+        parts = (self._part(e, d) for e, d in enumerate(self.layout.tolist()))
+        vals, widths = zip(*map(pick, parts))
+        width = torch.cat([torch.as_tensor(one, device=self.device).view(-1) for one in widths])
+        return RaggedTorch(*(ReadOnlyTensor(x, refusal) for x in (torch.cat(vals), width.long())))
+
+
+class _Part(NamedTuple):
+    """One environment's part of a scenery."""
+
+    lines: torch.Tensor  # (l, 2, 2): its agents', its objects', walls
+    texels: torch.Tensor  # (w, 4), line by line, with their light
+    widths: torch.Tensor  # (l,) integers, texels of each line
+    lights: torch.Tensor  # (k, 3)
 
 
 def _same(name, what, expected, actual) -> None:
     if expected != actual:
         raise ValueError(f"{name} must have {what}, so {expected}, but {actual} were given")
-
-
-def _widths(bounds) -> list[int]:
-    return [last - first for first, last in zip(bounds, bounds[1:])]
 
 
 def _fixed(name, tensor) -> torch.Tensor:
@@ -243,4 +273,4 @@ def _starts(name, widths) -> torch.Tensor:
             f"scenery holds at most 2,147,483,647 walls and texels of each kind, but "
             f"{int(ends[-1])} were given: use fewer layouts"
         )
-    return _fixed(name, torch.cat([ends.new_zeros(1), ends]).to(torch.int32))
+    return _fixed(name, torch.cat([ends.new_zeros(1), ends]).int())

@@ -1,4 +1,4 @@
-"""A base of environments in which one agent walks through a floor plan and sees by cameras."""
+"""A base of environments in which agents walk through a floor plan and see by cameras."""
 
 import inspect
 from collections.abc import Mapping, Sequence
@@ -24,19 +24,21 @@ __all__ = ["FirstPerson", "images"]
 
 
 def images(view: engine.Observation) -> arrdict:
-    """Returns ``rgb`` (N, A, 3, C, P), ``d`` (N, A, 1, C, P) and ``imu`` (N, A, 3) as views of an
+    """Returns ``rgb`` (B, 1, 3, C, P), ``d`` (B, 1, 1, C, P) and ``imu`` (B, 1, 3) as views of an
     observation's tensors: an image has a row per camera.
     """
     rgb, d = view.rgb, view.depth
     assert rgb is not None and d is not None
     if rgb.ndim == 4:  # one camera
         rgb, d = rgb.unsqueeze(2), d.unsqueeze(2)
-    return arrdict(rgb=rgb.transpose(2, 3), d=d.unsqueeze(2), imu=view.imu)
+    by_agent = arrdict(rgb=rgb.transpose(2, 3), d=d.unsqueeze(2), imu=view.imu)
+    return by_agent.map(lambda leaf: leaf.flatten(0, 1).unsqueeze(1))
 
 
 class FirstPerson(SceneryEnv):
-    """N environments of one agent each, which momentum moves. A subclass defines ``_world``, and
-    takes the arguments below as ``*shared`` and ``**options``, which it passes on.
+    """N environments of agents that momentum moves, by default one each. A subclass defines
+    ``_world``, and may take the arguments below as ``*shared`` and ``**options``, which it passes
+    on.
 
     Observation:
         A dict of float16, for each of C cameras (1) W = ``res / subsample`` pixels (64).
@@ -80,11 +82,11 @@ class FirstPerson(SceneryEnv):
     def __init_subclass__(cls, **options: Any) -> None:
         """Gives a constructor's signature, which settings are made from, the arguments above."""
         super().__init_subclass__(**options)
-        if FirstPerson in cls.__bases__:
-            init: Any = cls.__init__
+        init: Any = cls.__init__
+        own = inspect.signature(init).parameters
+        if "shared" in own:
             named = {**inspect.signature(FirstPerson.__init__).parameters}
-            own = inspect.signature(init).parameters.items()
-            named |= {name: one for name, one in own if one.kind is one.KEYWORD_ONLY}
+            named |= {name: one for name, one in own.items() if one.kind is one.KEYWORD_ONLY}
             init.__signature__ = inspect.Signature([*named.values()])
             init.__annotations__ = FirstPerson.__init__.__annotations__ | init.__annotations__
 
@@ -107,21 +109,21 @@ class FirstPerson(SceneryEnv):
         if geometries is None:
             geometries = sources.sample(self.source, min(n_envs, 512), seed=seed)
         geometries = geometries if resample else spread(geometries, n_envs)
-        plans = scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device)
+        plans = scenery(geometries, self.n_agents, n_envs=n_envs, seed=seed, device=device)
         self.core = Core(plans, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
-        self.subsample = subsample
+        self.subsample, n_pixels = subsample, len(modules.downsample(torch.empty(res), subsample))
         self.spawner = self._furnish(geometries, resample)
         self.movement = modules.MomentumMovement(self.core, control=control)
         self.action_space = self.movement.space
         self.obs_space = dotdict(
-            rgb=modules.RGB(self.core, subsample).space,
-            d=modules.Depth(self.core, subsample).space,
+            rgb=spaces.MultiImage(1, 3, len(cameras), n_pixels, low=0, high=1),
+            d=spaces.MultiImage(1, 1, len(cameras), n_pixels, low=0, high=1),
             imu=spaces.MultiVector(1, 3),
         )
-        engine.fit(n_envs, 8 * self.obs_space.d.H * self.obs_space.d.W + 64, self.device)
+        engine.fit(n_envs, self.n_agents * (8 * len(cameras) * n_pixels + 64), self.device)
         self.ages = self._integers()
-        self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
+        self.ended = torch.zeros_like(self.ages, dtype=torch.bool)
         self._resets = engine.Resets()
         self.privileged_space = None
 
@@ -131,7 +133,7 @@ class FirstPerson(SceneryEnv):
 
     def _integers(self) -> torch.Tensor:
         """Returns zeros (B,) int32."""
-        return torch.zeros(self.n_envs, dtype=torch.int32, device=self.device)
+        return torch.zeros(self.n_envs * self.n_agents, dtype=torch.int32, device=self.device)
 
     def _begin(self, mask) -> arrdict:
         self.ended.copy_(mask)
@@ -158,8 +160,8 @@ class FirstPerson(SceneryEnv):
         return engine.observe(core.scenery, core.agents, self.subsample, imu=True, **seen)
 
     def _seen_by(self, e: int) -> arrdict:
-        """Returns the observation of environment ``e``, without a lane's axis."""
-        return images(self._view(self.core.alone(e))).map(lambda leaf: leaf[0])
+        """Returns the observations of environment ``e``'s agents, (A, ...)."""
+        return images(self._view(self.core.alone(e))).map(lambda leaf: leaf.squeeze(1))
 
     @classmethod
     def _draw(

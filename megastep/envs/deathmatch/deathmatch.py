@@ -10,19 +10,16 @@ import torch
 from pydantic import Field
 
 from megastep import engine, modules, plotting, spaces
-from megastep import geometries as sources
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.core import Core
 from megastep.devices import threads
-from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.engine.launch_params import state_params
-from megastep.envs.common import SceneryEnv, step_outputs, world_of
+from megastep.envs.common import step_outputs, world_of
 from megastep.envs.deathmatch.bot import LIBRARY, Bot
-from megastep.envs.first_person import images
+from megastep.envs.first_person import FirstPerson, images
 from megastep.kernels.build.launch import launch
-from megastep.scene import scenery, spread
 from megastep.schedules import Number, Scheduled
 from megastep.settings import MAX_ENVS, checked
 from megastep.types import Geometries
@@ -44,12 +41,7 @@ Reward = Annotated[float, Field(ge=-1000, le=1000)]
 ScheduledReward = Annotated[Number, Scheduled(ge=-1000, le=1000)]
 
 
-def by_lane(obs) -> arrdict:
-    """Returns observations (N, A, ...) as (B, 1, ...)."""
-    return obs.map(lambda leaf: leaf.flatten(0, 1).unsqueeze(1))
-
-
-class Deathmatch(SceneryEnv):
+class Deathmatch(FirstPerson):
     """Agents in one home hit each other by looking at each other.
 
     In each step, an agent hits whoever is at the centre of its view; there is no trigger. A hit
@@ -148,29 +140,11 @@ class Deathmatch(SceneryEnv):
         resample: bool = False,
         privileged: bool = False,
     ):
-        if geometries is None:
-            geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
-        geometries = geometries if resample else spread(geometries, n_envs)
-        homes = scenery(geometries, n_agents, n_envs=n_envs, seed=seed, device=device)
-        self.core = Core(homes, res, fov, fps, seed=seed)
-        self.n_envs, self.n_agents = n_envs, n_agents
-        self.device, self.fps, self.subsample = self.core.device, self.core.fps, subsample
-        self.spawner = modules.RandomSpawns(
-            geometries,
-            self.core,
-            max(MIN_SPAWNS, SPAWNS_PER_AGENT * n_agents),
-            resample=resample,
-            hidden=True,
-        )
-        self.movement = modules.MomentumMovement(self.core)
-        pixels = res // subsample
+        self.n_agents, self.limit = n_agents, limit
+        lens: dict = dict(res=res, subsample=subsample, fov=fov, fps=fps)
+        super().__init__(n_envs, geometries, seed=seed, device=device, resample=resample, **lens)
         n_privileged = 1 + LIBRARY.constants["PRIVILEGED_PER_OPPONENT"] * (n_agents - 1)
-        self.obs_space = dotdict(
-            rgb=spaces.MultiImage(1, 3, 1, pixels, low=0, high=1),
-            d=spaces.MultiImage(1, 1, 1, pixels, low=0, high=1),
-            imu=spaces.MultiVector(1, 3),
-            health=spaces.MultiVector(1, 3, low=0, high=(1, 1, n_agents - 1)),
-        )
+        self.obs_space["health"] = spaces.MultiVector(1, 3, low=0, high=(1, 1, n_agents - 1))
         if hearing:
             self.obs_space["sound"] = spaces.MultiVector(1, 3, low=(0, -1, -1), high=1)
         self.action_space = spaces.MultiDiscrete(1, len(modules.MOVES))
@@ -193,22 +167,20 @@ class Deathmatch(SceneryEnv):
             aim_reward=aim_reward,
         )
         self.coefficients, self.has_aim = (self.weights,), aim_reward != 0
-        words = -(-homes.layouts.max_texels // 32) if search_reward else 0
-        bytes_per_lane = 8 * pixels + 4 * n_privileged * privileged + 4 * words + 128
+        words = -(-self.core.scenery.layouts.max_texels // 32) if search_reward else 0
+        bytes_per_lane = 4 * n_privileged * privileged + 4 * words + 64
         engine.fit(n_envs, n_agents * bytes_per_lane, self.device)
-        self.seen = None
-        if search_reward:
-            shape = n_envs, n_agents, words
-            self.seen = torch.zeros(shape, dtype=torch.int32, device=self.device)
-        on: dict = dict(device=self.device)
-        n_lanes = n_envs * n_agents
-        self.health = torch.ones(n_lanes, **on)
-        self.tally = torch.zeros((TALLY_ROWS, n_lanes), **on)
-        self.ages = torch.zeros(n_lanes, dtype=torch.int32, **on)
-        self.ended = torch.zeros(n_lanes, dtype=torch.bool, **on)
+        shape = n_envs, n_agents, words
+        self.seen = torch.zeros(shape, dtype=torch.int32, device=self.device) if words else None
+        self.health = torch.ones_like(self.ages, dtype=torch.float32)
+        self.tally = torch.zeros((TALLY_ROWS, n_envs * n_agents), device=self.device)
         # steps of the round, -1 if the next begins one
-        self.round_ages = torch.zeros(n_envs, dtype=torch.int32, **on) if resample else None
+        self.round_ages = self.ages[::n_agents].clone() if resample else None
         self._resets = engine.Resets(lanes_last=("tally",))
+
+    def _furnish(self, geometries, resample) -> modules.RandomSpawns:
+        n_spawns = max(MIN_SPAWNS, SPAWNS_PER_AGENT * self.n_agents)
+        return modules.RandomSpawns(geometries, self.core, n_spawns, resample, hidden=True)
 
     def _begin(self, mask) -> arrdict:
         self.ended.copy_(mask)
@@ -224,8 +196,7 @@ class Deathmatch(SceneryEnv):
 
     def desync(self) -> None:
         """Gives every lane a random age, from the seed, so that episodes do not end together."""
-        limits = torch.full_like(self.ages, self.rules["limit"])
-        self.ages.copy_(modules.random_ages(limits, self.core.seed))
+        super().desync()
         if self.round_ages is not None:
             self.round_ages.copy_(self.ages.view(self.n_envs, -1).amax(1))
 
@@ -254,7 +225,7 @@ class Deathmatch(SceneryEnv):
             search = dict(seen=self.seen, clear_mask=self.ended.view(self.n_envs, self.n_agents))
         view = self._view(**search)
         out = self._judge(view, rules)
-        obs = arrdict(by_lane(images(view)), health=out["health_obs"])
+        obs = arrdict(images(view), health=out["health_obs"])
         if out["sound"] is not None:
             obs["sound"] = out["sound"]
         world = world_of(out, obs, METRICS)
@@ -295,16 +266,7 @@ class Deathmatch(SceneryEnv):
         return outputs
 
     def _view(self, core=None, **search) -> engine.Observation:
-        core = core or self.core
-        return engine.observe(
-            core.scenery,
-            core.agents,
-            self.subsample,
-            imu=True,
-            centre_line=True,
-            agent_ray=self.has_aim,
-            **search,
-        )
+        return super()._view(core, centre_line=True, agent_ray=self.has_aim, **search)
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`, (A, ...) each.
@@ -317,11 +279,9 @@ class Deathmatch(SceneryEnv):
         assert view.centre_line is not None
         line = view.centre_line[0]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
-        shown = images(view)
         return arrdict(
+            images(view).map(lambda leaf: leaf.squeeze(1)),
             core=self.core.state(e),
-            rgb=shown.rgb[0],
-            d=shown.d[0],
             health=self.health[lanes].clone(),
             kills=self.tally[0, lanes].clone(),
             age=self.ages[lanes].clone(),
