@@ -11,10 +11,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from megastep.agents.networks.web import LIBRARY as POLICY
 from megastep.envs.deathmatch.bot import LIBRARY as DEATHMATCH
-from megastep.envs.explorer.explorer import LIBRARY as EXPLORER
-from megastep.envs.keys.keys import LIBRARY as KEYS
-from megastep.envs.memory.memory import LIBRARY as MEMORY
-from megastep.envs.pointgoal.pointgoal import LIBRARY as POINTGOAL
+from megastep.envs.explorer import LIBRARY as EXPLORER
+from megastep.envs.keys import LIBRARY as KEYS
+from megastep.envs.memory import LIBRARY as MEMORY
+from megastep.envs.pointgoal import LIBRARY as POINTGOAL
 from megastep.envs.pong.tracker import LIBRARY as PONG
 from megastep.kernels.build import compile
 from megastep.kernels.build.kernel_library import WASM_FLAGS

@@ -2,12 +2,13 @@
 
 ``bake``, ``physics``, ``render``, ``observe``, ``spawn`` and ``uniform`` check their arguments,
 allocate their outputs and launch one kernel each. None of them synchronises host and device. An
-argument that does not fit raises a TypeError or ValueError that names it.
+argument that does not fit raises a TypeError or ValueError that names it; what only the device can
+see, such as a NaN position, an EngineError: on the CPU at once, on a GPU by ``check``.
 """
 
 from megastep.devices import device, fit, free_memory, set_threads, threads
 from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_flag
-from megastep.engine.objects import Objects, check_objects
+from megastep.engine.objects import Objects
 from megastep.engine.operations import (
     Physics,
     bake,
@@ -31,6 +32,6 @@ from megastep.kernels.build.launch import without_early_starts
 
 __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents", "EngineError", "Layouts", "Objects"]
 __all__ += ["Observation", "Physics", "Render", "Resets", "Scenery", "bake", "check", "check_flag"]
-__all__ += ["check_objects", "device", "fit", "free_memory", "observe", "physics", "place_objects"]
+__all__ += ["device", "fit", "free_memory", "observe", "physics", "place_objects"]
 __all__ += ["render", "set_threads", "spawn", "threads", "uniform", "update_agent_geometry"]
 __all__ += ["update_objects", "without_early_starts"]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 
 from megastep.engine import checks
-from megastep.engine.objects import check_objects
+from megastep.engine.objects import Objects
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import ENGINE
 from megastep.read_only import SetOnce
@@ -87,7 +87,13 @@ _MESSAGES = dict(
     BAD_GOAL="An agent of environment {env} has a goal or a spawn point that its layout does not "
     "have: indices must be from 0 to the number per layout - 1.",
 )
-_ERRORS = {ENGINE.constants[name]: message for name, message in _MESSAGES.items()}
+_OF_OBJECTS = dict(
+    BAD_POSE="has a non-finite position or angle, or a size that is not above 0",
+    BAD_COLOUR="has a colour that the palette does not have: colours are integers from 0",
+    BAD_CARRIER="is carried by an agent that does not exist: carriers are agents, or -1 for none",
+    OUTSIDE="is outside of its home",
+    NO_ROOM="does not fit anywhere: use fewer or smaller objects, more points, or larger homes",
+)
 
 
 def check(agents: Agents) -> None:
@@ -97,23 +103,27 @@ def check(agents: Agents) -> None:
     Raises:
         EngineError: naming an environment with a non-finite position, angle or velocity, with an
             action that is NaN, or with an action, layout or goal that does not exist; or naming
-            an object, see :func:`check_objects`.
+            an object, and what is wrong with it.
     """
-    check_flag(checks.instance("agents", agents, Agents).error_flag)
-    checked = vars(agents).get("_checked")  # the scenery that the agents were last in
-    if checked and checked.key.objects:
-        check_objects(checked.key.objects)
+    checked = vars(checks.instance("agents", agents, Agents)).get("_checked")
+    check_flag(agents.error_flag, checked and checked.key.objects)  # the last scenery's
 
 
-def check_flag(error_flag: torch.Tensor) -> None:
+def check_flag(error_flag: torch.Tensor, objects: Objects | None = None) -> None:
     """Does what :func:`check` does, for an environment without :class:`Agents`, whose flag,
     (1,) int32, it clears.
     """
-    flag = error_flag.item()
-    if flag:
-        error_flag.zero_()
-        env, kind = divmod(flag, ENGINE.constants["ERROR_KINDS"])
-        raise EngineError(_ERRORS[kind].format(env=env))
+    flag = int(error_flag.item())
+    if not flag:
+        return
+    error_flag.zero_()
+    index, number = divmod(flag, ENGINE.constants["ERROR_KINDS"])
+    kinds = [kind for kind in (*_MESSAGES, *_OF_OBJECTS) if ENGINE.constants[kind] == number]
+    kind = kinds[0] if kinds else "NONFINITE"
+    if kind in _MESSAGES or objects is None:
+        raise EngineError(_MESSAGES.get(kind, "{env}").format(env=index))
+    env, k = divmod(index, objects.n_objects)
+    raise EngineError(f"In environment {env}, {objects.names[k]} {_OF_OBJECTS[kind]}.")
 
 
 def check_on_cpu(agents: Agents) -> None:

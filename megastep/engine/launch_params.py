@@ -86,7 +86,7 @@ def object_params(scenery: Scenery) -> bytes:
 def _pack_objects(o, extents) -> bytes:
     tensors = "shapes", "line_starts", "line_object", "palette", "lines", "texels", "ends"
     return ENGINE.params.ObjectsParams(
-        **{name: getattr(o, name) for name in (*tensors, "error_flag", "n_objects", "n_colours")},
+        **{name: getattr(o, name) for name in (*tensors, "n_objects", "n_colours")},
         extents=extents,
         objects=o.records,
         n_lines=len(o.line_object),

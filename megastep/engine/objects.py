@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from megastep.engine import checks
-from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import ENGINE
 from megastep.read_only import SetOnce
 
@@ -28,16 +27,8 @@ SHAPES = {
 }
 NUMBERS = {name: ENGINE.constants[name.upper()] for name in SHAPES}
 _BYTES = ENGINE.constants["OBJECT_BYTES"]
+MAX_OBJECTS_IN_ALL = (2**31 - 1) // ENGINE.constants["ERROR_KINDS"]
 MAX_OBJECTS = 256  # per environment, so that its lines fit into shared memory
-_KINDS = ENGINE.constants["OBJECT_ERROR_KINDS"]
-_MESSAGES = dict(
-    BAD_POSE="has a non-finite position or angle, or a size that is not above 0",
-    BAD_COLOUR="has a colour that the palette does not have: colours are integers from 0",
-    BAD_CARRIER="is carried by an agent that does not exist: carriers are agents, or -1 for none",
-    OUTSIDE="is outside of its home",
-    NO_ROOM="does not fit anywhere: use fewer or smaller objects, more points, or larger homes",
-)
-_ERRORS = {ENGINE.constants[name]: message for name, message in _MESSAGES.items()}
 
 
 class Objects(SetOnce):
@@ -72,7 +63,6 @@ class Objects(SetOnce):
         lines: (N, L, 2, 2), written by every render, those of object 0 first.
         texels: (N, O, 4), red, green, blue and light, written by every render.
         line_starts: (O + 1,) int32, the first line of each object.
-        error_flag: (1,) int32, see :func:`check_objects`.
 
     Raises:
         ValueError: naming the argument that does not fit.
@@ -93,7 +83,7 @@ class Objects(SetOnce):
             checks.word("shapes", shape, [*SHAPES]) for shape in checks.items("shapes", shapes)
         ]
         self.n_envs, self.n_objects = n, checks.integer("len(shapes)", len(shapes), 1, MAX_OBJECTS)
-        checks.integer("n_envs * len(shapes)", n * len(shapes), 1, (2**31 - 1) // _KINDS)
+        checks.integer("n_envs * len(shapes)", n * len(shapes), 1, MAX_OBJECTS_IN_ALL)
         self.lit = checks.flag("lit", lit)
         self.names = [*names] if names is not None else [f"object {k}" for k in range(len(shapes))]
         self.palette = checks.floats("palette", palette, ("P", 3), device)
@@ -112,7 +102,6 @@ class Objects(SetOnce):
         self.ends = torch.tensor(ends, dtype=torch.float32).to(device)
         self.lines = torch.zeros((n, int(widths.sum()), 2, 2), device=device)
         self.texels = torch.zeros((n, len(shapes), 4), device=device)
-        self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
 
     # views of records: four floats, two integers, three flags
     positions = property(lambda self: self.records[..., :2])
@@ -132,15 +121,3 @@ class Objects(SetOnce):
         is_object = (index >= 0) & (index < len(self.line_object))
         objects = self.line_object.long()[index.clamp(0, len(self.line_object) - 1)]
         return objects.masked_fill(~is_object, -1)
-
-
-def check_objects(objects: Objects) -> None:
-    """Raises EngineError, naming environment and object, if the device flagged an object since the
-    last check; so does :func:`megastep.engine.check`. Synchronises host and device.
-    """
-    flag = objects.error_flag.item()
-    if flag:
-        objects.error_flag.zero_()
-        index, kind = divmod(int(flag), _KINDS)
-        env, k = divmod(index, objects.n_objects)
-        raise EngineError(f"In environment {env}, {objects.names[k]} {_ERRORS[kind]}.")

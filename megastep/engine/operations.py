@@ -1,6 +1,6 @@
-"""Operations of one launch: light, movement, spawning, objects, random numbers. Randomness comes
-from the counter-based generator Philox 4x32-10. N environments, A agents and O objects per
-environment, D layouts, B lanes.
+"""Operations of one launch: light, movement, spawning, objects, random numbers, by the
+counter-based generator Philox 4x32-10. N environments, A agents and O objects each, D layouts, B
+lanes.
 """
 
 import math
@@ -16,7 +16,6 @@ from megastep.engine.launch_params import (
     object_params,
     scenery_params,
     seed_params,
-    state_params,
     world_params,
 )
 from megastep.engine.scenery import Scenery
@@ -31,11 +30,9 @@ APART = 0.05  # metres
 
 
 def bake(scenery: Scenery) -> None:
-    """Computes the light on every wall texel, in place. Call it after moving walls or lights.
-
-    Writes ``scenery.layouts.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights of the
-    layout that no wall occludes, with intensity I and distance d. Also refits the walls' bounding
-    boxes.
+    """Writes the light on every wall texel, ``scenery.layouts.baked``, and refits the walls'
+    bounding boxes. Call it after moving walls or lights. The light is min(1, 0.1 + sum of 2 I /
+    max(d^2, 1)) over the lights of the layout that no wall occludes, of intensity I, d metres away.
     """
     layouts = checks.instance("scenery", scenery, Scenery).layouts
     layouts.update_bounding_boxes()
@@ -67,10 +64,8 @@ def physics(
     moves: torch.Tensor | None = None,
     damping: float = 1.0,
 ) -> Physics:
-    """Moves the agents by their velocities for 1 / fps seconds, in place.
-
-    An agent stops just before the first wall, agent or solid object that it touches, and its
-    velocities become 0.
+    """Moves the agents by their velocities for 1 / fps seconds, in place. An agent stops just
+    before the first wall, agent or solid object that it touches, and its velocities become 0.
 
     Args:
         actions: (N, A) int64, or (N, A, n_moves) float32. If given, velocities are first multiplied
@@ -78,11 +73,6 @@ def physics(
             [-1, 1], add all rows, weighted. If None, ``moves`` must be None too.
         moves: (n_moves, 3) m/s ahead, m/s left, deg/s, added by actions.
         damping: fraction of the velocities lost per step.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
-        EngineError: on the CPU, if a position or an action is NaN, or an integer action is out of
-            range. On a GPU, :func:`~megastep.engine.check` raises it later.
     """
     n, a = lanes = lanes_of(scenery, agents)
     checks.number("damping", damping, -math.inf, math.inf)
@@ -135,9 +125,8 @@ def spawn(
     cumulative: torch.Tensor | None = None,
 ) -> None:
     """Puts agents at random points of their environment's layout, at rest, with random headings.
-
-    They drop the objects that they carry, and avoid points on solid objects, unless these were of
-    another layout.
+    They drop what they carry, and avoid points on solid objects, unless these were of another
+    layout.
 
     Args:
         mask: (N, A) bool, agents to respawn.
@@ -152,9 +141,6 @@ def spawn(
         cumulative: (D,) int32, cumulative weights of the layouts, by which `resample` draws them:
             whole numbers from 0 whose sum, the last entry, is from 1 to 2**31 - 1. Default: every
             layout is as likely.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
     """
     lanes, device, n_layouts = lanes_of(scenery, agents), scenery.device, len(scenery.layouts)
     n_points = checks.length("points", points, axis=1)
@@ -164,12 +150,10 @@ def spawn(
             f"{n_points} were given"
         )
     int32 = torch.int32, device
-    is_hidden, n_envs = checks.flag("hidden", hidden), scenery.n_envs
-    kernel, n_threads = ("spawn_hidden", WARP * n_envs) if is_hidden else ("spawn", n_envs)
-    if scenery.objects is not None:
-        kernel += "_objects"
+    kernel = "spawn_hidden" if checks.flag("hidden", hidden) else "spawn"
+    kernel += "" if scenery.objects is None else "_objects"
     launch(
-        *(ENGINE, kernel, device, n_threads),
+        *(ENGINE, kernel, device, scenery.n_envs * (WARP if hidden else 1)),
         **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
         mask=checks.address("mask", mask, lanes, torch.bool, device),
         points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, device),
@@ -212,9 +196,8 @@ def update_objects(scenery: Scenery, agents: Agents) -> None:
         return
     launch(
         *(ENGINE, "update_objects", scenery.device, n * scenery.objects.n_objects),
-        scenery=scenery_params(scenery, agents.radius),
+        **world_params(scenery, agents, "positions", "angles"),
         objects=object_params(scenery),
-        **state_params(scenery, agents, "positions", "angles"),
     )
     check_on_cpu(agents)
 
@@ -229,10 +212,8 @@ def place_objects(
     apart: float = APART,
 ) -> None:
     """Puts objects at random points of their environment's layout, visible, carried by nobody, at
-    random angles.
-
-    Each is put at the first point that fits, counted from a random one: agents and visible objects
-    are at least ``apart`` from it. Crates and doors count as discs of their size. Objects that are
+    random angles: each at the first point, counted from a random one, that is at least ``apart``
+    from agents and visible objects. Crates and doors count as discs of their size. Objects that are
     placed by the same call do not keep clear of each other's old positions.
 
     Args:
@@ -241,10 +222,6 @@ def place_objects(
         counts: (N, O) int32, numbers drawn so far. Each placed object's is advanced by one.
         seed: the generator's key.
         apart: metres.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
-        EngineError: on the CPU, if an object fits nowhere; on a GPU, :func:`check` raises it later.
     """
     lanes_of(scenery, agents)
     if scenery.objects is None:
@@ -255,9 +232,8 @@ def place_objects(
     points_shape = len(scenery.layouts), n_points, 2
     launch(
         *(ENGINE, "place_objects", device, scenery.n_envs),
-        **world_params(scenery, agents),
+        **world_params(scenery, agents, "positions", "angles"),
         objects=object_params(scenery),
-        agents=state_params(scenery, agents, "positions")["positions"],
         mask=checks.address("mask", mask, shape, torch.bool, device),
         points=checks.address("points", points, points_shape, torch.float32, device),
         counts=checks.address("counts", counts, shape, torch.int32, device),

@@ -104,9 +104,8 @@ def observe(
     clear_mask: torch.Tensor | None = None,
     max_depth: float = 10.0,
 ) -> Observation:
-    """Renders what training needs, in one pass and without full-resolution tensors.
-
-    Equals :func:`render` followed by the sensors of :mod:`~megastep.modules`. With one agent per
+    """Renders what training needs, in one pass and without full-resolution tensors: the same as
+    :func:`render` followed by the sensors of :mod:`~megastep.modules`. With one agent per
     environment, ``scenery.lines`` is not updated, nor are unlit objects' lines.
 
     Args:
@@ -116,9 +115,6 @@ def observe(
             view are marked in place and counted in ``newly_seen``.
         clear_mask: (N, A) bool, agents whose ``seen`` is cleared first.
         max_depth: metres beyond the agent's radius at which depth reads 0.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
     """
     lanes, device = lanes_of(scenery, agents), scenery.device
     if agents.res % checks.integer("subsample", subsample, 1, MAX_SUBSAMPLE):

@@ -25,24 +25,24 @@ HD int is_drawn(const Object& object) {
 
 // Writes object i's pose, if it is carried, and flags what is wrong with it. `object` is as placed.
 HD void settle(const ObjectsParams& o, const SceneryParams& s, const Object& object, int layout,
-               int i) {
+               int i, int* error_flag) {
     if (is_agent(object.carrier, s.n_agents)) {
         objects_of(o)[i].x = object.x;
         objects_of(o)[i].y = object.y;
         objects_of(o)[i].angle = object.angle;
     } else if (object.carrier != -1) {
-        flag_object(o, i, BAD_CARRIER);
+        flag_error(error_flag, i, BAD_CARRIER);
     }
     if (!is_there(object))
         return;
     Float4 extent = LOAD((const Float4*)o.extents + layout);
     if (!is_drawn(object))
-        flag_object(o, i, BAD_POSE);
+        flag_error(error_flag, i, BAD_POSE);
     else if (object.x < extent.x || object.y < extent.y || object.x > extent.z ||
              object.y > extent.w)
-        flag_object(o, i, OUTSIDE);
+        flag_error(error_flag, i, OUTSIDE);
     else if ((unsigned int)object.colour >= (unsigned int)o.n_colours)
-        flag_object(o, i, BAD_COLOUR);
+        flag_error(error_flag, i, BAD_COLOUR);
 }
 
 // An object's texel: red, green, blue and light.

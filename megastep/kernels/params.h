@@ -15,14 +15,17 @@ struct BakeParams {
     int n_texels;
 };
 
-struct PhysicsParams {
+struct WorldParams {
     SceneryParams scenery;
-    float* positions;          // (N, A, 2) metres, updated in place
-    float* angles;             // (N, A) degrees, updated in place
-    float* velocity;           // (N, A, 2) metres per second
+    float* positions;  // (N, A, 2) metres
+    float* angles;     // (N, A) degrees
+    int* error_flag;   // (1) out: see common/errors.h
+};
+
+struct PhysicsParams : WorldParams {
+    float* velocity;           // (N, A, 2) metres per second; as poses, updated in place
     float* angvelocity;        // (N, A) degrees per second
     float* progress;           // (N, A) out: fraction of the step that was free, in [0, 1]
-    int* error_flag;           // (1) out: see common/errors.h
     const long long* actions;  // (N, A) null: there are no discrete actions
     const float* controls;     // (N, A, n_moves) null: there are no continuous actions
     const float* moves;  // (n_moves, 3) added by an action: velocity ahead, velocity left, turning
@@ -33,21 +36,13 @@ struct PhysicsParams {
     ObjectsParams objects;
 };
 
-struct UpdateAgentGeometryParams {
-    SceneryParams scenery;
-    const float* positions;  // (N, A, 2)
-    const float* angles;     // (N, A)
-    int* error_flag;         // (1) out: see common/errors.h
-    int lit;                 // 1: light the agents' texels too
+struct UpdateAgentGeometryParams : WorldParams {
+    int lit;  // 1: light the agents' texels too
 };
 
-struct RenderParams {
-    SceneryParams scenery;
-    const float* positions;    // (N, A, 2)
-    const float* angles;       // (N, A)
+struct RenderParams : WorldParams {
     const float* yaws;         // (C) degrees, added to the agent's angle
     const float* ray_lengths;  // (R) length of each ray per unit of depth
-    int* error_flag;           // (1) out: see common/errors.h
     int n_cameras;             // C
     int res;                   // R
     float half_width;          // tan(fov / 2): the edge of the screen at unit depth
@@ -79,18 +74,14 @@ struct RenderParams {
     ObjectsParams objects;
 };
 
-struct SpawnParams {
-    SceneryParams scenery;
-    float* positions;           // (N, A, 2) out where mask, as the next three
-    float* angles;              // (N, A)
-    float* velocity;            // (N, A, 2)
+struct SpawnParams : WorldParams {
+    float* velocity;            // (N, A, 2) as poses, out where mask
     float* angvelocity;         // (N, A)
     const unsigned char* mask;  // (N, A) agents that respawn
     const float* points;        // (D, n_points, 2) spawn points
     int* counts;                // (N, A) in and out: numbers drawn so far, the generator's counter
     int* point_index;           // (N, A) out where mask: the layout's point
     const int* cumulative;      // (D) cumulative weights of the layouts; null: all are as likely
-    int* error_flag;            // (1) out: see common/errors.h
     unsigned int key0;          // the seed
     unsigned int key1;
     int n_points;
@@ -98,21 +89,15 @@ struct SpawnParams {
     ObjectsParams objects;
 };
 
-struct UpdateObjectsParams {
-    SceneryParams scenery;
+struct UpdateObjectsParams : WorldParams {
     ObjectsParams objects;
-    const float* positions;  // (N, A, 2)
-    const float* angles;     // (N, A)
 };
 
-struct PlaceObjectsParams {
-    SceneryParams scenery;
+struct PlaceObjectsParams : WorldParams {
     ObjectsParams objects;
-    const float* agents;        // (N, A, 2) metres
     const unsigned char* mask;  // (N, O) objects to place
     const float* points;        // (D, n_points, 2) metres
     int* counts;                // (N, O) in and out: numbers drawn so far
-    int* error_flag;            // (1) out: see common/errors.h
     unsigned int key0;          // the seed
     unsigned int key1;
     int n_points;

@@ -9,7 +9,7 @@ HD int fits(const PlaceObjectsParams& p, int env, int i, float x, float y) {
     const ObjectsParams& o = p.objects;
     float size = objects_of(o)[i].size, apart = p.scenery.radius + size + p.apart;
     for (int a = env * p.scenery.n_agents; a < (env + 1) * p.scenery.n_agents; a++) {
-        float dx = x - p.agents[2 * a], dy = y - p.agents[2 * a + 1];
+        float dx = x - p.positions[2 * a], dy = y - p.positions[2 * a + 1];
         if (dx * dx + dy * dy < apart * apart)
             return 0;
     }
@@ -40,15 +40,14 @@ HD void place_objects_of(const PlaceObjectsParams& p, int env) {
     for (int i = env * o.n_objects; i < (env + 1) * o.n_objects; i++) {
         if (!p.mask[i])
             continue;
-        Philox bits = philox((unsigned int)i, (unsigned int)p.counts[i], p.key0, p.key1);
-        p.counts[i] = (int)((unsigned int)p.counts[i] + 1u);  // wraps, as Philox's counter does
-        int first = (int)(unit_float(bits.a) * (float)p.n_points), point = first, n_tried = 0;
+        Philox bits = next_draw(p.counts, i, p.key0, p.key1);
+        int first = below(bits.a, p.n_points), point = first, n_tried = 0;
         while (n_tried < p.n_points && !fits(p, env, i, points[2 * point], points[2 * point + 1])) {
             point = point + 1 == p.n_points ? 0 : point + 1;
             n_tried++;
         }
         if (n_tried == p.n_points)
-            flag_object(o, i, NO_ROOM);
+            flag_error(p.error_flag, i, NO_ROOM);
         Object& object = objects_of(o)[i];
         object.x = points[2 * point];
         object.y = points[2 * point + 1];

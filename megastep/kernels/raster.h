@@ -2,8 +2,11 @@
 // an affine function of the pixel's index. In a camera's frame x is depth and y points left.
 #pragma once
 #include "common/math.h"
-#include "constants.h"
 #include "params.h"
+
+constexpr int MAX_RES = 1024;          // rays per camera: 32 tiles of 32 pixels
+constexpr int MAX_SUBSAMPLE = 32;      // rays per pixel: at most one warp
+constexpr int NEAREST_LINE_BYTES = 8;  // of shared memory per ray, while rendering
 
 // The nearest line at a pixel. On the GPU each warp keeps one per pixel in dynamic shared memory.
 struct alignas(8) NearestLine {

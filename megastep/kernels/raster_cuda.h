@@ -3,7 +3,6 @@
 // that the group covers: each warp lane takes one pixel and keeps, of the lines that cover it, the
 // one with the largest inverse depth, or the first of equals.
 #pragma once
-#include "constants.h"
 #include "raster.h"
 #include "render.h"
 #include "shading.h"
@@ -198,7 +197,7 @@ DEVICE int raster_objects(View<is_split>& v, const RenderParams& p, const EnvSce
         if (own < o.n_objects) {
             object = object_at(p, env, own);
             if (a == 0)
-                settle(o, p.scenery, object, layout, env * o.n_objects + own);
+                settle(o, p.scenery, object, layout, env * o.n_objects + own, p.error_flag);
             if (is_drawn(object) && object.carrier != a)
                 bounds = bounds_of_disc(v.camera, v.screen, p.half_width, object.x, object.y,
                                         1.42f * object.size);  // with a crate's corners

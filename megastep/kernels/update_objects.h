@@ -11,11 +11,9 @@ HD void update_object(const UpdateObjectsParams& p, int i) {
     const ObjectsParams& o = p.objects;
     const SceneryParams& s = p.scenery;
     int env = i / o.n_objects, k = i % o.n_objects;
-    int layout = s.layout[env];
-    if ((unsigned int)layout >= (unsigned int)s.n_layouts)
-        layout = 0;  // which is flagged where it is rendered
+    int layout = layout_of(s, env, p.error_flag);
     Object object = placed(objects_of(o)[i], s, p.positions, p.angles, env);
-    settle(o, s, object, layout, i);
+    settle(o, s, object, layout, i, p.error_flag);
     Float4* lines = (Float4*)o.lines + env * (long long)o.n_lines;
     Lines own = lines_of(o, k);
     for (int l = own.first; l < own.end; l++)

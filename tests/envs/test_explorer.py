@@ -7,7 +7,7 @@ import torch
 
 from megastep import contract, core, envs, modules, scene, toys
 from megastep.arrdict import arrdict
-from megastep.envs.explorer.explorer import texel_runs
+from megastep.envs.explorer import texel_runs
 from megastep.geometries import sample
 from tests.helpers import explorer_twin, random_scenery
 from tests.helpers.outputs import Poison

@@ -10,9 +10,9 @@ from test_geodesics import room
 
 from megastep import core, engine, envs, geometry, modules, scene, toys
 from megastep.coefficients import Coefficients
+from megastep.envs.pointgoal import PROGRESS_ROWS
 from megastep.envs.pointgoal import goals as module
 from megastep.envs.pointgoal.goals import goal_fields, packed
-from megastep.envs.pointgoal.pointgoal import PROGRESS_ROWS
 from megastep.geodesics import Geodesics, geodesics
 from megastep.geometries import sample
 from tests.helpers.outputs import Poison

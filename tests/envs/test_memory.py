@@ -7,7 +7,7 @@ import torch
 from megastep import envs, toys
 from megastep.arrdict import arrdict
 from megastep.envs.first_person import images
-from megastep.envs.memory.memory import arrangements
+from megastep.envs.memory import arrangements
 from megastep.geometries import sample
 from megastep.modules.objects import REACH
 from tests.helpers import memory_twin

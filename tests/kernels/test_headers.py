@@ -35,7 +35,7 @@ def test_packed_structs_have_the_compilers_layout(library, tmp_path):
     declaring = [
         name for name in names if kernel_library.STRUCT.search(library.sources(".h")[name])
     ]
-    packed, code = {}, '#include "common/objects.h"\n'
+    packed, code = {}, '#include "common/objects.h"\n#include "common/step.h"\n'
     code += "".join(f'#include "{name}"\n' for name in declaring)
     for name, layout in library.structs.items():
         fields = dict(kernel_library._fields(layout))
@@ -143,18 +143,17 @@ def test_words_are_the_scalars_of_nested_structs_in_order():
     assert arrays["third"].offset == 48 + 2 * 24 and len(arrays) == 3 + 3 * 3 + 2 * 3
 
 
-@libraries
-def test_constants_have_the_compilers_values(library, tmp_path):
-    own = '#include "constants.h"\n' if (library.folder / "constants.h").exists() else ""
-    code = '#include "common/constants.h"\n' + own
-    for name in library.constants:
-        code += f'extern "C" double read_{name}() {{ return {name}; }}\n'
-    binary = compiled(tmp_path, library, code)
-    assert {"BLOCK", "WARP"} <= library.constants.keys()
-    for name, number in library.constants.items():
-        read = getattr(binary, f"read_{name}")
-        read.restype = ctypes.c_double
-        assert read() == pytest.approx(number, rel=1e-7, abs=0), name
+def test_constants_are_those_of_headers_that_are_plain_numbers(tmp_path):
+    (tmp_path / "numbers.h").write_text(
+        "constexpr int COUNT = -12;  // of\n"
+        "// constexpr int OLD = 1;\nconstexpr float HALF = .5f;\n"
+        "constexpr float SMALL = -2.5e-3f;\nconstexpr int MASK = 0x7f;\n"
+        "constexpr int TWICE = 2 * COUNT;\n"
+    )
+    constants = kernel_library.KernelLibrary(tmp_path).constants
+    own = {name: number for name, number in constants.items() if name not in ENGINE.constants}
+    assert own == dict(COUNT=-12, HALF=0.5, SMALL=-0.0025)
+    assert constants["BLOCK"] == 64 and constants["WARP"] == 32
 
 
 @pytest.mark.parametrize("field", ["double x;", "float x, y;", "OtherParams other;", "int x[3];"])

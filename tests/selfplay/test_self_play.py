@@ -8,7 +8,7 @@ import torch
 from megastep import capture, devices
 from megastep.agents.cli import evaluate, train
 from megastep.agents.runs import checkpoint, json_lines
-from megastep.envs.pong.pong import CELL
+from megastep.envs.pong import CELL
 from tests.cli.test_duels import PONG, UPDATE
 from tests.cli.test_train import configured
 from tests.helpers import pages

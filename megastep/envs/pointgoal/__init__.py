@@ -1,5 +1,156 @@
-"""PointGoal: the environment, with the kernel of its step."""
+"""PointGoal: navigate to a point given by its distance and bearing."""
 
-from megastep.envs.pointgoal.pointgoal import PointGoal
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import torch
+from pydantic import Field
+
+from megastep import modules, spaces
+from megastep.arrdict import arrdict
+from megastep.coefficients import Coefficients
+from megastep.dotdict import dotdict
+from megastep.engine import Resets
+from megastep.engine.launch_params import seed_params
+from megastep.envs.common import Weight, judged, world_of
+from megastep.envs.first_person import FirstPerson, images
+from megastep.envs.pointgoal.goals import goal_fields
+from megastep.geodesics import CELL
+from megastep.kernels.build.kernel_library import KernelLibrary
+from megastep.modules.lifecycle import derived_seed
+from megastep.settings import checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["PointGoal"]
+
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
+PROGRESS_ROWS = LIBRARY.constants["PROGRESS_ROWS"]  # numbers that describe an episode so far
+N_PRIVILEGED = LIBRARY.constants["N_PRIVILEGED"]  # numbers that a critic sees
+METRICS = "success", "spl", "soft_spl", "collisions"
+REACH = 0.2  # metres from the goal that count as success
+
+
+class PointGoal(FirstPerson):
+    """Point-goal navigation: walk to a point given by its distance and bearing.
+
+    Observation:
+        ``rgb``, ``d`` and ``imu`` of :class:`~megastep.envs.first_person.FirstPerson`, and float16
+        ``goal``: (B, 1, 3), in the agent's frame: straight-line distance / 10 m, cosine and sine
+        of the bearing.
+
+    Actions:
+        Those of :class:`~megastep.envs.first_person.FirstPerson`.
+
+    Reward:
+        Metres by which the shortest path to the goal became shorter, minus ``cost``, minus
+        ``walk_cost`` per metre walked, plus ``bonus`` at success.
+
+    Episode end:
+        Terminal within 0.2 m of the goal (success). Truncated after ``limit`` steps.
+
+    Metrics:
+        ``success``: 1 if the goal was reached.
+        ``spl``: success weighted by path length (Anderson et al. 2018): 0 without success, else the
+            length of the shortest path divided by the length walked, at most 1.
+        ``soft_spl``: the same with the fraction of the distance covered in place of success (Datta
+            et al. 2020).
+        ``collisions``: steps that a wall cut short.
+
+    Args:
+        nearest: minimum length of the shortest path to a goal, in metres.
+        furthest: maximum length of the shortest path to a goal, in metres.
+        limit: steps after which an episode is truncated.
+        bonus: reward for success. As the costs it is a number or a schedule.
+        cost: subtracted from the reward of every step.
+        walk_cost: subtracted from the reward per metre walked. SPL counts metres, ``cost`` steps.
+        privileged: worlds hold ``privileged.way`` (1, 4) for a critic: tens of metres to go by the
+            shortest path, the slope of that distance ahead and to the left, and the fraction of the
+            steps that is left.
+    """
+
+    @checked
+    def __init__(
+        self,
+        *shared: Any,
+        nearest: Annotated[float, Field(ge=0, le=1000)] = 1.0,
+        furthest: Annotated[float, Field(gt=0, le=1000)] = 15.0,
+        limit: Annotated[int, Field(ge=1, le=10**6)] = 500,
+        bonus: Weight = 5.0,
+        cost: Weight = 0.02,
+        walk_cost: Weight = 0.0,
+        privileged: bool = False,
+        **options: Any,
+    ):
+        self.range, self.limit = (nearest, furthest), limit
+        super().__init__(*shared, **options)
+        self.seed = derived_seed(self.core.seed, "pointgoal")
+        self.weights = Coefficients(self.device, bonus=bonus, cost=cost, walk_cost=walk_cost)
+        self.coefficients = (self.weights,)
+        bounds: dict = dict(low=(0, -1, -1), high=(math.inf, 1, 1))
+        self.obs_space["goal"] = spaces.MultiVector(1, 3, **bounds)
+        if privileged:
+            self.privileged_space = dotdict(way=spaces.MultiVector(1, N_PRIVILEGED))
+        self.goal_index, self.n_draws = self._integers(), self._integers()
+        # x and y one step ago; metres to go by the shortest path, now and at the start; length of
+        # the shortest path from the start; metres walked; collisions
+        self.progress = torch.zeros((PROGRESS_ROWS, self.n_envs), device=self.device)
+        self._resets = Resets(lanes_last=("progress",))
+
+    def _furnish(self, geometries, resample) -> modules.RandomSpawns:
+        self.goals, points = goal_fields(geometries, self.core, *self.range)
+        return modules.RandomSpawns(geometries, self.core, resample=resample, points=points)
+
+    def _world(self, free=None) -> arrdict:
+        self.spawner(self.ended)
+        out = self._judge(free)
+        obs = arrdict(images(self._view()), goal=out["goal_obs"])
+        return world_of(out, obs, METRICS, way="privileged")
+
+    def _judge(self, free) -> dict:
+        """Rewards agents for getting closer to their goals, and draws those of new episodes."""
+        return judged(
+            *(self, LIBRARY, "pointgoal_step", len(METRICS)),
+            *(dict(goal_obs=3), dict(privileged=N_PRIVILEGED)),
+            free=free,
+            spawn_index=self.spawner.point_index,
+            **self.goals._asdict(),
+            last=self.goals.fields[-1:],
+            n_draws=self.n_draws,
+            goal_index=self.goal_index,
+            progress=self.progress,
+            **seed_params(self.seed),
+            per_cell=1 / CELL,
+            reach=REACH,
+            **self.weights.tensors,
+            limit=self.limit,
+            n_goals=self.goals.points.shape[1],
+            n_spawns=self.goals.lengths.shape[1],
+        )
+
+    def state(self, e: int = 0) -> arrdict:
+        """Returns environment ``e`` for :meth:`plot_state`."""
+        layout, goal = self.layout[e].long(), self.goal_index[e].long()
+        _, _, distance, _, shortest, walked, _ = self.progress[:, e].clone()
+        return arrdict(
+            self._seen_by(e),
+            core=self.core.state(e),
+            goal=self.goals.points[layout, goal].clone(),
+            age=self.ages[e].clone(),
+            distance=distance,
+            shortest=shortest,
+            walked=walked,
+        )
+
+    @classmethod
+    def plot_state(cls, state: arrdict) -> "Figure":
+        """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan with the goal,
+        and the agent's RGB and depth.
+        """
+        title = (
+            f"step {state.age} · {state.distance:.1f} of {state.shortest:.1f} m to go"
+            f" · {state.walked:.1f} m walked"
+        )
+        return cls._draw(state, title, (state.goal, REACH))

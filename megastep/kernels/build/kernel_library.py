@@ -4,7 +4,7 @@ sources, so that structs, constants and operations are declared once:
 * structs whose names end in ``Params``, one field per line: ``const float* positions;``, or an
   array of such structs: ``LeafParams leaves[4];``. A struct may begin with the fields of another:
   ``struct PongParams : StepParams {``
-* constants in files called ``constants.h``, one per line: ``constexpr int MAX_RES = 1024;``
+* constants that are plain numbers, one per line: ``constexpr int MAX_RES = 1024;``
 * operations, each at the start of a line: ``KERNEL render(RenderParams p)``; for a GPU,
   ``INSTANCE(spawn, SpawnParams, ...)``; in a header, for CPU and GPU, ``EACH(uniform, ...)``
 """
@@ -46,7 +46,7 @@ CUDA_FLAGS = (
 #: NVRTC's flags where no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
 FAST_CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
 
-CONSTANT = re.compile(r"constexpr\s+(int|float)\s+(\w+)\s*=\s*(\S+?)f?;")
+CONSTANT = re.compile(r"^constexpr (int|float) (\w+) = (-?[\d.]+(?:e-?\d+)?)f?;", re.M)
 STRUCT = re.compile(r"^struct (\w+Params)(?: : (\w+Params))? \{(.*?)^\};", re.M | re.S)
 FIELD = re.compile(r"(?:const )?([\w ]+?)\s*(\*?)\s*\b(\w+)(?:\[(\d+)\])?")
 OPERATION = re.compile(
@@ -83,8 +83,8 @@ class KernelLibrary:
 
     The folder holds operations: for the CPU in ``.cpp`` files, for the GPU in ``.cu`` files, or for
     both as EACH in a header, which nothing else includes. Headers declare the struct of each
-    launch; ``constants.h`` holds what the kernels share with Python. Sources include the folder's
-    headers by name and the common ones as ``"common/errors.h"``.
+    launch, and constants. Sources include the folder's headers by name and the common ones as
+    ``"common/errors.h"``.
 
     Args:
         folder: where the sources are.
@@ -92,7 +92,7 @@ class KernelLibrary:
         cpu_flags: the C++ compiler's flags.
 
     Attributes:
-        constants: {name: number} from ``constants.h``, the folder's and the common one.
+        constants: {name: number} of the folder's and the common headers.
         structs: {struct: its layout in memory}.
         words: {struct: all its pointers and numbers}, those of structs that are fields too. Where
             pointers take 4 bytes, as in WebAssembly, a struct is an array of them, 4 bytes each.
@@ -117,10 +117,9 @@ class KernelLibrary:
 
     @cached_property
     def constants(self) -> dict[str, Any]:
-        files = (text for name, text in self.sources(".h").items() if name.endswith("constants.h"))
+        found = CONSTANT.findall("\n".join(self.sources(".h").values()))
         return {
-            name: int(number) if kind == "int" else float(number)
-            for kind, name, number in CONSTANT.findall("\n".join(map(_without_comments, files)))
+            name: int(number) if kind == "int" else float(number) for kind, name, number in found
         }
 
     @cached_property

@@ -6,24 +6,22 @@ constexpr int BLOCK = 64;      // threads per block, in every launch
 constexpr int WARP = 32;       // threads per warp
 constexpr int BOX_WALLS = 32;  // walls of a layout that share a bounding box, one per warp lane
 
-// Errors that only the device can see. A flag holds ERROR_KINDS * env + kind; 0 means no error.
-constexpr int ERROR_KINDS = 8;
-constexpr int NONFINITE = 1;   // a position, angle or velocity is NaN or infinite
-constexpr int BAD_ACTION = 2;  // an action outside of the action space
-constexpr int BAD_LAYOUT = 3;  // a layout that the scenery does not have
-constexpr int BAD_GOAL = 4;    // a goal or a spawn point that the layout does not have
-constexpr int NAN_ACTION = 5;  // a continuous action that is NaN
+// Errors that only the device can see. A flag holds ERROR_KINDS * index + kind; 0 means no error.
+// The index is an environment's or, of the last five, an object's among those of all environments.
+constexpr int ERROR_KINDS = 16;
+constexpr int NONFINITE = 1;    // a position, angle or velocity is NaN or infinite
+constexpr int BAD_ACTION = 2;   // an action outside of the action space
+constexpr int BAD_LAYOUT = 3;   // a layout that the scenery does not have
+constexpr int BAD_GOAL = 4;     // a goal or a spawn point that the layout does not have
+constexpr int NAN_ACTION = 5;   // a continuous action that is NaN
+constexpr int BAD_POSE = 6;     // a pose that is not finite, or a size that is not above 0
+constexpr int BAD_COLOUR = 7;   // a colour that the palette does not have
+constexpr int BAD_CARRIER = 8;  // a carrier that is no agent
+constexpr int OUTSIDE = 9;      // a position outside of the home
+constexpr int NO_ROOM = 10;     // nowhere to put it
 
 // Shapes of objects: a hexagon in a disc, a square, a segment.
 constexpr int DISC = 0;
 constexpr int CRATE = 1;
 constexpr int DOOR = 2;
 constexpr int OBJECT_BYTES = 32;  // of a record
-
-// Errors of objects. Their flag holds OBJECT_ERROR_KINDS * (O env + object) + kind.
-constexpr int OBJECT_ERROR_KINDS = 8;
-constexpr int BAD_POSE = 1;     // a pose that is not finite, or a size that is not above 0
-constexpr int BAD_COLOUR = 2;   // a colour that the palette does not have
-constexpr int BAD_CARRIER = 3;  // a carrier that is no agent
-constexpr int OUTSIDE = 4;      // a position outside of the home
-constexpr int NO_ROOM = 5;      // nowhere to put it

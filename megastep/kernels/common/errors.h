@@ -5,7 +5,9 @@
 #include "common/constants.h"
 #include "common/math.h"
 
-HD void flag_error(int* error_flag, int env, int kind) { *error_flag = ERROR_KINDS * env + kind; }
+HD void flag_error(int* error_flag, int index, int kind) {
+    *error_flag = ERROR_KINDS * index + kind;
+}
 
 HD void flag_nonfinite(int* error_flag, int env, float x, float y, float angle) {
     if (!is_finite(x) || !is_finite(y) || !is_finite(angle))

@@ -29,7 +29,6 @@ struct ObjectsParams {
     float* objects;          // (N, O) records of the struct Object
     float* lines;            // (N, L, 4) out; an object that is not there has lines of 0 m
     float* texels;           // (N, O, 4) out: red, green, blue, light
-    int* error_flag;         // (1) out: OBJECT_ERROR_KINDS * (O env + object) + kind
     int n_objects;           // 0: there are none
     int n_lines;
     int n_colours;
@@ -43,10 +42,6 @@ HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
 HD int object_of(const ObjectsParams& o, int l) {
     int k = o.line_object[l];
     return (unsigned int)k < (unsigned int)o.n_objects ? k : 0;
-}
-
-HD void flag_object(const ObjectsParams& o, int i, int kind) {
-    *o.error_flag = OBJECT_ERROR_KINDS * i + kind;
 }
 
 HD int is_there(const Object& object) { return object.visible && !object.open; }

@@ -1,10 +1,12 @@
 // One step of Explorer: where episodes start and end, rewards, the fraction of the home that was
-// seen, and what a critic sees: counts of the visible texels that are still unseen, in the bins of
-// bins.h.
+// seen, and what a critic sees: counts of the visible texels that are still unseen, in bins around
+// the agent.
 #pragma once
-#include "bins.h"
 #include "common/step.h"
-#include "constants.h"
+
+constexpr int BANDS = 3;      // of distance: up to 1.5 m, up to 4 m, beyond
+constexpr int SECTORS = 16;   // of bearing
+constexpr int N_EPISODE = 4;  // numbers that a critic sees of an episode
 
 // N environments, A agents per environment, D layouts, S runs of texels of all layouts together.
 struct ExplorerStepParams : GameParams {
@@ -53,6 +55,36 @@ HD Pose pose_of(const ExplorerStepParams& p, int agent, int env) {
     flag_nonfinite(p.error_flag, env, x, y, angle);
     return pose_at(x, y, angle);
 }
+
+// ---- Bins around an agent: sectors of bearing relative to its heading, bands of distance ----
+
+constexpr int BINS = BANDS * SECTORS;
+constexpr float BAND_ENDS[] = {1.5f, 4.f};  // metres
+
+// Sector 0 is straight ahead, 4 to the left, 8 behind. Bearings are compared with the tangents of
+// odd multiples of 11.25 degrees, which needs no arc tangent.
+HD int sector_of(float ahead, float left) {
+    float along = ahead < 0.f ? -ahead : ahead, across = left < 0.f ? -left : left;
+    int sector = (across > 0.19891237f * along) + (across > 0.66817864f * along) +
+                 (across > 1.49660576f * along) + (across > 5.02733949f * along);
+    if (ahead < 0.f)
+        sector = SECTORS / 2 - sector;
+    return left < 0.f ? (SECTORS - sector) % SECTORS : sector;
+}
+
+HD int band_of(float ahead, float left) {
+    float squared = ahead * ahead + left * left;
+    return (squared > BAND_ENDS[0] * BAND_ENDS[0]) + (squared > BAND_ENDS[1] * BAND_ENDS[1]);
+}
+
+// The bin of the point (x, y) as seen from `pose`.
+HD int bin_of(const Pose& pose, float x, float y) {
+    float dx = x - pose.x, dy = y - pose.y;
+    float ahead = pose.cosine * dx + pose.sine * dy, left = pose.cosine * dy - pose.sine * dx;
+    return SECTORS * band_of(ahead, left) + sector_of(ahead, left);
+}
+
+// ---- Episodes ----
 
 // An agent's episode.
 struct Episode {

@@ -5,7 +5,8 @@
 #include "common/objects.h"
 #include "common/philox.h"
 #include "common/step.h"
-#include "constants.h"
+
+constexpr int OPEN = -1;  // the state of a doorway without a door
 
 // N environments of one agent, D layouts, M episodes per layout, C colours, K doorways. Objects are
 // C keys, the goal, then K doors. Positions are written where an episode starts. Metrics: success,

@@ -5,7 +5,8 @@
 #include "common/objects.h"
 #include "common/philox.h"
 #include "common/step.h"
-#include "constants.h"
+
+constexpr int N_GOAL = 4;  // numbers that a critic sees of the object to find
 
 // N environments of one agent, D layouts, O objects. Metric: objects found.
 struct MemoryStepParams : GameParams {

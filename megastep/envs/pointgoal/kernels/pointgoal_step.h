@@ -3,7 +3,18 @@
 #pragma once
 #include "common/philox.h"
 #include "common/step.h"
-#include "constants.h"
+
+// Rows of `progress`, which describes an agent's episode so far.
+constexpr int PREVIOUS_X = 0;  // position one step ago, in metres
+constexpr int PREVIOUS_Y = 1;
+constexpr int DISTANCE = 2;        // to the goal by the shortest path, from the goal's field
+constexpr int START_DISTANCE = 3;  // the same at the start of the episode
+constexpr int SHORTEST = 4;        // exact length of the shortest path from the start
+constexpr int WALKED = 5;          // metres walked since the start
+constexpr int COLLISIONS = 6;      // since the start
+constexpr int PROGRESS_ROWS = 7;
+
+constexpr int N_PRIVILEGED = 4;  // numbers that a critic sees
 
 // N environments, A agents per environment, D layouts. Metrics: success, SPL, soft SPL, collisions.
 struct PointgoalStepParams : GameParams {
@@ -20,7 +31,7 @@ struct PointgoalStepParams : GameParams {
     const int* n_in_range;     // (D, n_spawns) number of goals that may be drawn
     int* n_draws;              // (N, A) in and out, as the next two: numbers drawn so far
     int* goal_index;           // (N, A) the agent's goal, of its layout's
-    float* progress;           // (PROGRESS_ROWS, N, A) see constants.h
+    float* progress;           // (PROGRESS_ROWS, N, A) see above
     unsigned short* goal_obs;  // (N, A, 3) fp16: distance / 10 m, cosine and sine of the bearing
     float* privileged;         // (N, A, N_PRIVILEGED) for a critic; null: none
     unsigned int key0;         // the seed
