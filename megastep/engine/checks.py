@@ -1,5 +1,6 @@
 """Checks of arguments. Their errors name the argument, what is allowed and what was given."""
 
+import contextlib
 import math
 import numbers
 import operator
@@ -26,14 +27,12 @@ def _refuse(name, wanted, value, kind: type[Exception] = ValueError) -> NoReturn
 
 def integer(name: str, value: object, min: int, max: float = math.inf) -> int:
     """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
-    try:
-        number = None if isinstance(value, bool) else operator.index(value)  # pyright: ignore
-    except (TypeError, RuntimeError, ValueError):
-        number = None
-    if number is None or not min <= number <= max:
-        range_ = f"from {min} to {max}" if max < math.inf else f"of at least {min}"
-        _refuse(name, f"an integer {range_}", value)
-    return number
+    with contextlib.suppress(TypeError, RuntimeError, ValueError):
+        number = operator.index(value)  # pyright: ignore[reportArgumentType]
+        if min <= number <= max and not isinstance(value, bool):
+            return number
+    range_ = f"from {min} to {max}" if max < math.inf else f"of at least {min}"
+    _refuse(name, f"an integer {range_}", value)
 
 
 def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: str = "") -> float:
@@ -91,11 +90,8 @@ def device(name: str, value: Any) -> torch.device:
 
 
 def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) -> torch.Tensor:
-    """Returns ``value`` as a contiguous float32 tensor on ``device``.
-
-    Raises:
-        ValueError: unless it is an array of that shape, in which a string stands for any size, and
-            its numbers are below 1e9.
+    """Returns ``value`` as a contiguous float32 tensor on ``device``. ValueError unless it is an
+    array of that shape, in which a string stands for any size, and its numbers are below 1e9.
     """
     try:
         tensor = torch.as_tensor(value)
@@ -103,19 +99,18 @@ def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) 
         tensor = tensor.to(device=device, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None
-    if tensor is None or not _fits(tensor.shape, shape):
-        _refuse(name, f"an array of numbers of shape ({_sizes(shape)})", value)
+    sizes = () if tensor is None else tensor.shape
+    fits = len(sizes) == len(shape) and all(
+        isinstance(size, str) or size == n for size, n in zip(shape, sizes)
+    )
+    if tensor is None or not fits:
+        wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+        _refuse(name, f"an array of numbers of shape ({wanted})", value)
     if not bool((tensor.abs() < LIMIT).all()):
         raise ValueError(
             f"{name} must hold numbers below {LIMIT:g}, but one is NaN, infinite or larger"
         )
     return tensor.contiguous()
-
-
-def _fits(sizes, shape) -> bool:
-    return len(sizes) == len(shape) and all(
-        isinstance(size, str) or size == n for size, n in zip(shape, sizes)
-    )
 
 
 def ragged(name: str, value: Any, shape: Sequence, device: torch.device | None) -> RaggedTorch:
@@ -199,15 +194,7 @@ def _refuse_tensor(name, wanted, value) -> NoReturn:
     _refuse(name, wanted, value, ValueError if isinstance(value, torch.Tensor) else TypeError)
 
 
-# ---- Words ----
-
-
-def _sizes(shape) -> str:
-    return ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
-
-
 def _described(value) -> str:
-    """Describes a value in a few words."""
     if isinstance(value, torch.Tensor):
         if value.layout is not torch.strided:
             return f"a {value.layout} tensor"

@@ -10,8 +10,6 @@ from megastep.core import Core
 from megastep.engine import checks
 
 ENDLESS = 2**31 - 1  # steps; the largest int32, which ages and limits are
-
-
 #: What draws by seeds derived from that of an environment.
 STREAMS = "spawns", "lifespans", "pointgoal", "ages", "points", "objects", "memory", "keys"
 
@@ -22,15 +20,9 @@ def derived_seed(seed: int, stream: str) -> int:
 
 
 class CounterGenerator:
-    """A counter-based random generator (Philox) with a counter per lane.
-
-    The k-th draw of a lane depends on the seed, the lane and k only. So it is the same on the CPU,
-    on a GPU and in a CUDA graph.
-
-    Args:
-        n_lanes: number of lanes, B.
-        seed: from 0 to 2**64 - 1.
-        device: where the numbers are drawn.
+    """A counter-based random generator (Philox) with a counter per lane: the k-th draw of a lane
+    depends on the seed, from 0 to 2**64 - 1, the lane and k only. So it is the same on the CPU, on
+    a GPU and in a CUDA graph.
     """
 
     def __init__(self, n_lanes: int, seed: int, device: torch.device | str):
@@ -58,26 +50,17 @@ def random_ages(limits: torch.Tensor, seed: int) -> torch.Tensor:
 
 
 class RandomLifespans:
-    """Random time limits of episodes, for the argument ``limit`` of :class:`Lifecycle`.
-
-    Args:
-        core: the environment's core.
-        shortest: minimum lifespan, steps.
-        longest: maximum lifespan, steps.
-        seed: of the lifespans. Default: the core's.
+    """Random time limits of episodes, from ``shortest`` to ``longest`` steps, for the argument
+    ``limit`` of :class:`Lifecycle`. The seed is the core's by default.
     """
 
     def __init__(
         self, core: Core, shortest: int = 128, longest: int = 256, seed: int | None = None
     ):
-        shortest = checks.integer("shortest", shortest, 0, ENDLESS)
-        longest = checks.integer("longest", longest, 0, ENDLESS)
-        if not 0 < shortest <= longest:
-            raise ValueError(
-                f"lifespans need 0 < shortest <= longest, but shortest={shortest} and "
-                f"longest={longest} were given"
-            )
-        self.shortest, self.longest = shortest, longest
+        self.shortest = checks.integer("shortest", shortest, 1, ENDLESS)
+        self.longest = checks.integer("longest", longest, 1, ENDLESS)
+        if shortest > longest:
+            raise ValueError(f"shortest={shortest} and longest={longest} leave no lifespan between")
         seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         n_lanes, seed = core.n_envs * core.n_agents, derived_seed(seed, "lifespans")
         self.random = CounterGenerator(n_lanes, seed, core.device)
@@ -95,7 +78,6 @@ class Lifecycle:
     the next one, whatever the decision says. A step that begins an episode cannot end it.
 
     Args:
-        core: the environment's core.
         limit: number of steps, or :class:`RandomLifespans`. None sets no limit; the environment may
             write its own into ``limits``.
 
@@ -127,18 +109,13 @@ class Lifecycle:
         return self.ended.clone()
 
     def desync(self) -> None:
-        """Gives every lane a random age below its limit, so that episodes do not end together. Call
-        it after ``env.reset``.
-        """
+        """Gives every lane a random age, so that episodes do not end together, after a reset."""
         self.ages.copy_(random_ages(self.limits, self.seed))
 
     def __call__(self, reset: torch.Tensor, terminal: torch.Tensor | None = None) -> arrdict:
-        """Counts one step. Returns the world's flags, arrdict(reset, terminal, truncated).
-
-        Args:
-            reset: (B,) bool, lanes that begin an episode in this step.
-            terminal: (B,) bool, lanes whose episode ends by the environment's own rule. Ignored
-                where ``reset`` is True; takes precedence over the time limit.
+        """Counts one step. Returns the world's flags, arrdict(reset, terminal, truncated), of lanes
+        that begin an episode, ``reset`` (B,) bool, and those whose episode ends by the game's rule,
+        ``terminal``. That is ignored where ``reset``, and goes before the time limit.
         """
         checks.alike("reset", reset, self.ended)
         if terminal is not None:

@@ -1,5 +1,5 @@
-"""Movement by actions, and vectors between the global frame and agents' frames. N environments, A
-agents, B = N A lanes.
+"""Movement by actions, and vectors between the global frame and agents' frames. N environments of
+A agents, B = N A lanes.
 """
 
 import math
@@ -66,10 +66,8 @@ class _Movement:
             self.space = spaces.MultiContinuous(core.n_agents, len(CONTROLS))
 
     def __call__(self, decision: Mapping) -> engine.Physics:
-        """Moves the agents by ``decision["actions"]``: integers of shape (B, 1), (N, A) or (B,), or
-        float32 of shape (B, 1, 3), (N, A, 3) or (B, 3).
-
-        Returns the :class:`~megastep.engine.Physics` of the step.
+        """Moves the agents by ``decision["actions"]``: integers (B, 1), (N, A) or (B,), or float32
+        (B, 1, 3), (N, A, 3) or (B, 3). Returns the :class:`~megastep.engine.Physics` of the step.
         """
         n_agents, device = self.core.n_agents, self.core.device
         n_lanes, actions = self.core.n_envs * n_agents, decision["actions"]
@@ -88,7 +86,6 @@ class SimpleMovement(_Movement):
     """Actions set the velocity for one step.
 
     Args:
-        core: the environment's core.
         speed: m/s, along an axis of the agent.
         ang_speed: deg/s.
         control: discrete for seven actions (MultiDiscrete), or continuous for three numbers from
@@ -97,12 +94,7 @@ class SimpleMovement(_Movement):
     """
 
     def __init__(
-        self,
-        core: Core,
-        speed: float = 10.0,
-        ang_speed: float = 180.0,
-        *,
-        control: str = "discrete",
+        self, core: Core, speed: float = 10.0, ang_speed: float = 180.0, *, control="discrete"
     ):
         super().__init__(core, dict(speed=speed, ang_speed=ang_speed), 1.0, control)
 
@@ -111,7 +103,6 @@ class MomentumMovement(_Movement):
     """Actions accelerate the agent.
 
     Args:
-        core: the environment's core.
         accel: m/s^2, along an axis of the agent.
         ang_accel: deg/s^2.
         decay: fraction of both velocities that is lost per step.

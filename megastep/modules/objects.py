@@ -71,7 +71,7 @@ def doorways(geometries: Sequence[dotdict]) -> RaggedNumpy:
 
 
 class Objects:
-    """The objects of an environment, by kind. ``objects["key"]`` is a :class:`Kind`. They are
+    """The objects of an environment, by kind: ``objects["key"]`` is a :class:`Kind`. They are
     invisible until they are placed. Cameras see them, agents bump into the solid ones, and all that
     an environment does with them is PyTorch on :attr:`Kind.positions` and other tensors.
 

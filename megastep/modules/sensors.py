@@ -1,7 +1,6 @@
 """Sensors: RGB, depth and inertia. A call returns the observation of every agent. Each has a
-``space``, the ``state`` of one environment, and ``plot_state``, which draws a numpyified state.
-
-N environments, A agents, C cameras per agent, R rays per camera.
+``space``, the ``state`` of one environment, and ``plot_state``, which draws a numpyified state. N
+environments, A agents, C cameras per agent, R rays per camera.
 """
 
 from collections.abc import Sequence
@@ -37,8 +36,6 @@ def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
 
 
 class _Camera:
-    """Images of every agent's cameras, a mean of ``subsample`` rays per pixel."""
-
     name: str
     n_channels: int
 
@@ -69,25 +66,17 @@ class _Camera:
         axes: "Sequence[Area | Axes] | np.ndarray | None" = None,
         yaws: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Draws a numpyified :meth:`state` as one strip per agent, with a row per camera; depth in
-        grey, bright where near. Returns the axes.
-
-        Args:
-            state: from :meth:`state`.
-            axes: one per agent: strips of :func:`megastep.plotting.panels`, or matplotlib axes.
-                Default: those of a new figure.
-            yaws: (C,) degrees, shown as the names of the rows.
+        """Draws a numpyified :meth:`state` as one strip per agent, with a row per camera, named by
+        its yaw, (C,) degrees; depth in grey, bright where near. Returns the axes: those given, one
+        per agent, of matplotlib or :func:`megastep.plotting.panels`, or those of a new figure.
         """
         aspect = plotting.STRIP * np.shape(state)[-2]
         return plotting.plot_images({cls.name: state}, aspect=aspect, axes=axes, yaws=yaws)
 
 
 class RGB(_Camera):
-    """RGB images, float32 (N, A, 3, C, R / subsample), in linear light.
-
-    Args:
-        core: the environment's core.
-        subsample: rays per pixel; a pixel is their mean. Divides R.
+    """RGB images, float32 (N, A, 3, C, R / subsample), in linear light. A pixel is the mean of
+    ``subsample`` rays, which divides R.
     """
 
     name, n_channels = "rgb", 3
@@ -98,15 +87,9 @@ class RGB(_Camera):
 
 
 class Depth(_Camera):
-    """Depth images: float32 (N, A, 1, C, R / subsample).
-
-    A ray's depth is 1 - clamp((distance - radius) / max_depth, 0, 1): 1 at the agent's edge, 0 at
-    ``max_depth`` and beyond.
-
-    Args:
-        core: the environment's core.
-        subsample: rays per pixel; a pixel is their mean. Divides R.
-        max_depth: metres.
+    """Depth images, float32 (N, A, 1, C, R / subsample). A ray's depth is 1 - clamp((distance -
+    radius) / max_depth, 0, 1): 1 at the agent's edge, 0 at ``max_depth`` metres and beyond. A pixel
+    is the mean of ``subsample`` rays, which divides R.
     """
 
     name, n_channels = "depth", 1
@@ -120,12 +103,8 @@ class Depth(_Camera):
 
 
 class IMU:
-    """Inertia: float32 (N, A, 3), angular velocity / 360 deg/s and velocity / 10 m/s.
-
-    The velocity is in the agent's frame, forward and left.
-
-    Args:
-        core: the environment's core.
+    """Inertia, float32 (N, A, 3): angular velocity / 360 deg/s, and velocity / 10 m/s forward and
+    left.
     """
 
     def __init__(self, core: Core):
@@ -145,9 +124,7 @@ class IMU:
 
     @staticmethod
     def plot_state(state: np.ndarray, ax: "Axes | None" = None) -> "Axes":
-        """Draws a numpyified :meth:`state` as three bars per agent on ``ax``, by default on a new
-        figure. Returns the axes.
-        """
+        """Draws a numpyified :meth:`state` as three bars per agent. Returns the axes."""
         if ax is None:
             from matplotlib import pyplot
 

@@ -113,14 +113,12 @@ def spawn_points(
 
 class RandomSpawns:
     """Puts agents at random points in the rooms of their layout, at rest, with a random heading.
-
-    Each agent has spawn points of its own, 5 cm clear of the walls and of the other agents' points.
-    So agents that respawn together never overlap. An agent that respawns alone may land on another
-    that has walked there; physics lets overlapping discs part.
+    Each has spawn points of its own, 5 cm clear of the walls and of the other agents' points, so
+    agents that respawn together never overlap. One that respawns alone may land on another that has
+    walked there; physics lets overlapping discs part.
 
     Args:
         geometries: those that the scenery was made from.
-        core: the environment's core.
         n_spawns: points per layout, shared out among the agents.
         resample: move an environment to a random layout whenever all its agents respawn.
         seed: of the points and spawns. Default: the core's.
@@ -148,20 +146,17 @@ class RandomSpawns:
             raise ValueError(
                 f"n_spawns={n_spawns} is less than one point for each of the {core.n_agents} agents"
             )
-        self.core = core
-        self._n_layouts = len(core.scenery.layouts)
+        self.core, self._n_layouts = core, len(core.scenery.layouts)
         self.resample = checks.flag("resample", resample)
         self.hidden = checks.flag("hidden", hidden)
         self.seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         if points is None:
-            geometries = geometries[: len(core.scenery.layouts)]
             size = n_spawns, core.n_agents, core.agents.radius
-            points = torch.from_numpy(cached_points(geometries, *size, self.seed))
+            points = torch.from_numpy(
+                cached_points(geometries[: self._n_layouts], *size, self.seed)
+            )
         self.points = torch.as_tensor(points, device=core.device)
-        self.counts, self.point_index = (
-            torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
-            for _ in range(2)
-        )
+        self.counts, self.point_index = core.agent_full(0).int(), core.agent_full(0).int()
         #: (D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``. None:
         #: every layout is as likely.
         self.cumulative: torch.Tensor | None = None
@@ -169,18 +164,10 @@ class RandomSpawns:
     def __call__(self, reset: torch.Tensor) -> None:
         """Respawns the agents where ``reset``, (N, A) or (B,) bool, is True."""
         checks.length("reset", reset)
-        engine.spawn(
-            self.core.scenery,
-            self.core.agents,
-            to_agents(reset, self.core.n_agents),
-            self.points,
-            self.counts,
-            self.seed,
-            self.resample,
-            self.hidden,
-            self.point_index,
-            self.cumulative,
-        )
+        core, draws = self.core, (self.points, self.counts, self.seed)
+        options = self.resample, self.hidden, self.point_index, self.cumulative
+        mask = to_agents(reset, core.n_agents)
+        engine.spawn(core.scenery, core.agents, mask, *draws, *options)
 
     def weigh_layouts(self) -> torch.Tensor:
         """Has layouts be drawn by weights from now on, first by equal ones. Returns ``cumulative``,
@@ -213,19 +200,16 @@ def cached_points(
 
 
 class FreePoints:
-    """Draws random points in the rooms of environments' homes, such as goals or places for objects.
-
-    A disc of an agent's radius around each point is 5 cm clear of every wall. A point is drawn in
-    the layout that the environment shows at the call, so call it after the spawner. The k-th draw
-    is the same on the CPU, on a GPU and in a CUDA graph; a call does not synchronise.
+    """Draws random points in the rooms of environments' homes, such as goals or places for objects,
+    where an agent is 5 cm clear of every wall. A point is drawn in the layout that the environment
+    shows at the call, so call it after the spawner. The k-th draw is the same on the CPU, on a GPU
+    and in a CUDA graph; a call does not synchronise.
 
     Args:
         geometries: those that the scenery was made from.
-        core: the environment's core.
         n_points: points per layout to draw from.
         per_env: points drawn per environment, K. Default: one per agent.
-        seed: of the points and draws. Default: the core's. Two instances with equal seeds draw
-            equal points.
+        seed: of the points and draws. Default: the core's. Equal seeds draw equal points.
 
     Attributes:
         points: (D, n_points, 2) float32 metres, the points of each layout.
@@ -254,16 +238,14 @@ class FreePoints:
                 f"geometries must be those that the scenery was made from, one for each of its "
                 f"{n_layouts} layouts, but {len(geometries)} were given"
             )
-        geometries = geometries[:n_layouts]
-        points = cached_points(geometries, n_points, 1, core.agents.radius, seed)
+        points = cached_points(geometries[:n_layouts], n_points, 1, core.agents.radius, seed)
         self.points = torch.as_tensor(points, device=core.device)
         self.generator = CounterGenerator(core.n_envs * self.per_env, seed, core.device)
 
     def __call__(self, mask: torch.Tensor) -> torch.Tensor:
-        """Draws new points where ``mask``, (N, K) or (N * K,) bool, is True.
-
-        Returns (N, K, 2) float32 metres. Elsewhere these are the points of the last draw. If the
-        environment has moved to another layout since, they are arbitrary points of that one.
+        """Draws new points where ``mask``, (N, K) or (N * K,) bool, is True. Returns (N, K, 2)
+        float32 metres: elsewhere the points of the last draw or, if the environment has moved to
+        another layout since, arbitrary ones of that.
         """
         n_points = self.points.shape[1]
         index = (self.generator(mask)[:, 0] * n_points).long().view(-1, self.per_env)

@@ -101,7 +101,7 @@ def test_no_compiler(tmp_path, monkeypatch):
     assert "\n" not in str(error.value)
     monkeypatch.delenv("CXX")
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(compile.EngineError, match=r"c\+\+, g\+\+ and clang\+\+.*install"):
+    with pytest.raises(compile.EngineError, match=r"c\+\+, g\+\+, clang\+\+ are missing.*install"):
         compile.compiler()
 
 

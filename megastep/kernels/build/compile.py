@@ -1,7 +1,5 @@
-"""Builds a kernel library for the CPU or a GPU at first use, and loads it.
-
-The CPU library comes from the system's C++ compiler. The GPU's cubin comes from NVRTC, which is
-part of PyTorch's CUDA wheels, so nvcc is not needed. Both are cached under a hash of sources,
+"""Builds a kernel library at first use, and loads it: for a CPU by the system's C++ compiler, for
+a GPU by NVRTC, which is part of PyTorch's CUDA wheels. Both are cached under a hash of sources,
 flags, compiler and processor.
 """
 
@@ -63,11 +61,9 @@ def cpu(library: KernelLibrary) -> dict[str, Callable[[bytes], None]]:
 
 
 def end_threads_at_forks(library: "CDLL") -> None:
-    """Has the OpenMP runtime of a library end its threads before each ``os.fork``. Parent and child
-    start new ones when they next need them, with the same bits.
-
-    A fork copies only the thread that calls it, and GNU OpenMP does not notice: the first parallel
-    loop of the child would wait forever. Does nothing if the library uses no OpenMP.
+    """Has the OpenMP runtime of a library, if any, end its threads before each ``os.fork``; new
+    ones start when they are needed, with the same bits. A fork copies only the thread that calls
+    it, and GNU OpenMP does not notice: the first parallel loop of the child would wait forever.
     """
     pause = getattr(library, "omp_pause_resource_all", None)
     if pause is not None:
@@ -84,9 +80,7 @@ def compiler() -> tuple[str, str]:
         path = shutil.which(command)
         if path:
             return path, _run([path, "--version"])
-    problem = (
-        f"CXX={override} is not executable" if override else "c++, g++ and clang++ are missing"
-    )
+    problem = f"CXX={override} is not executable" if override else "c++, g++, clang++ are missing"
     raise EngineError(
         f"The CPU engine needs a C++ compiler, and {problem}: install one (Debian: apt install "
         f"g++) or set CXX to yours."
@@ -278,10 +272,8 @@ def check_status(result: tuple, action: str) -> Any:
 
 
 def _build_cuda(files, flags) -> bytes:
-    """Returns a cubin of all ``.cu`` files.
-
-    NVRTC gets every file under its own name, so its errors, ncu and compute-sanitizer name file and
-    line: physics.h:23.
+    """Returns a cubin of all ``.cu`` files. NVRTC gets every file under its own name, so its
+    errors, ncu and compute-sanitizer name file and line: physics.h:23.
     """
     _, nvrtc = bindings()
     names, texts = [name.encode() for name in files], [text.encode() for text in files.values()]

@@ -18,7 +18,6 @@ ENGINE = KernelLibrary(KERNELS)
 BLOCK = ENGINE.constants["BLOCK"]  # threads per block
 WARP = ENGINE.constants["WARP"]
 INVALID_CONTEXT = 201  # CUDA_ERROR_INVALID_CONTEXT
-MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
 USUAL_SHARED = 48 * 1024  # bytes of dynamic shared memory that any kernel may have
 #: {(kernel, GPU): bytes} of those that have more.
 _ALLOWED_SHARED: dict[tuple[object, int], int] = {}
@@ -46,13 +45,10 @@ def launch(
     /,
     **fields: object,
 ) -> None:
-    """Runs an operation of a kernel library: on a CPU before this returns, on a GPU on the
-    current stream.
+    """Runs an operation of a kernel library, which is built if need be, where its tensors are: on a
+    CPU before this returns, on a GPU on the current stream.
 
     Args:
-        library: its kernels are built if this is its first launch on the device.
-        operation: the kernel's name.
-        device: where its tensors are.
         shape: number of GPU threads, rounded up to whole blocks of `BLOCK`; or the `Blocks`. A GPU
             does nothing if there are none. A CPU ignores it.
         fields: all fields of the operation's struct. A pointer is a tensor, an address, or None for
@@ -63,11 +59,16 @@ def launch(
             the GPU refuses the launch.
         TypeError: if a field is missing, or the struct has none of that name.
     """
-    if device.type == "cpu":
-        struct = library.cpu_operations.get(operation)
-        if struct is None:
-            raise _missing(library, operation, ".cpp", "a GPU (device=cuda)")
-        packed = library.packers[struct](fields)
+    is_cpu = device.type == "cpu"
+    struct = (library.cpu_operations if is_cpu else library.cuda_operations).get(operation)
+    if struct is None:
+        suffix, other = (".cpp", "cuda") if is_cpu else (".cu", "cpu")
+        raise EngineError(
+            f"No {suffix} file in {library.folder} defines the operation {operation}: add one, or "
+            f"use device={other}."
+        )
+    packed = library.packers[struct](fields)
+    if is_cpu:
         for observer in _OBSERVERS:
             observer(library, operation, packed)
         cpu(library)[operation](packed)
@@ -76,17 +77,9 @@ def launch(
     x, y, n_threads, shared = blocks
     if not x * y * n_threads:
         return
-    if x * n_threads > MAX_THREADS:
-        raise EngineError(
-            f"{operation} needs {x * n_threads:,} threads on {device}, but a launch has at most "
-            f"{MAX_THREADS:,}: use fewer environments."
-        )
-    struct = library.cuda_operations.get(operation)
-    if struct is None:
-        raise _missing(library, operation, ".cu", "a CPU (device=cpu)")
     index = torch.cuda.current_device() if device.index is None else device.index
     function = cuda(library, index)[operation]
-    arguments = (ctypes.c_char_p * 1)(library.packers[struct](fields))
+    arguments = (ctypes.c_char_p * 1)(packed)
     with torch.cuda.device(index):
         if shared > USUAL_SHARED:
             _allow_shared(function, shared, index)
@@ -115,7 +108,6 @@ def observed(observer: Observer) -> Iterator[None]:
 @contextlib.contextmanager
 def without_early_starts() -> Iterator[None]:
     """Kernels launched or recorded inside, by any thread, start when the one before them has ended.
-
     Others may start earlier and wait on the GPU, which saves a single stream time. Where many
     streams share a GPU, those that wait take the place of those that could run.
     """
@@ -127,13 +119,6 @@ def without_early_starts() -> Iterator[None]:
         _n_without_early_starts -= 1
 
 
-def _missing(library, operation, suffix, other) -> EngineError:
-    return EngineError(
-        f"No {suffix} file in {library.folder} defines the operation {operation}: add one, or run "
-        f"on {other}."
-    )
-
-
 @functools.cache
 def _can_start_early(index: int) -> bool:
     """Returns whether a GPU has programmatic dependent launch."""
@@ -142,10 +127,8 @@ def _can_start_early(index: int) -> bool:
 
 @functools.lru_cache(maxsize=1024)  # making one takes as long as a third of a launch
 def _config(blocks: tuple[int, int, int, int], stream: int, is_early: bool) -> object:
-    """Returns what a launch needs beside its kernel and struct.
-
-    If it ``is_early``, it may start before the kernel before it has ended, for which it must wait
-    itself. After a copy, an event or a graph, it starts when that has ended.
+    """Returns what a launch needs beside its kernel and struct. If it ``is_early``, it may start
+    before the kernel before it has ended, for which it must wait itself.
     """
     driver, _ = bindings()
     config = driver.CUlaunchConfig()
@@ -173,10 +156,8 @@ def _allow_shared(function: object, shared: int, index: int) -> None:
 
 
 def make_current(index: int) -> None:
-    """Makes a GPU's context current in this thread.
-
-    Autograd's threads have no context until PyTorch's first operation there, and the driver, unlike
-    the runtime, does not set one.
+    """Makes a GPU's context current in this thread. Autograd's threads have none until PyTorch's
+    first operation there, and the driver, unlike the runtime, does not set one.
     """
     driver, _ = bindings()
     device = check_status(driver.cuDeviceGet(index), "Finding the GPU")
