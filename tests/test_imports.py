@@ -118,6 +118,7 @@ OWN_USERS = {
     "megastep.kernels.build.launch": (
         "megastep/devices.py",
         "megastep/engine/*.py",
+        "megastep/envs/common.py",
         "megastep/envs/*/*.py",
         "megastep/geodesics/__init__.py",
         "megastep/kernels/build/*.py",
