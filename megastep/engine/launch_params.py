@@ -132,18 +132,3 @@ def seed_params(seed: int) -> dict[str, int]:
     """Returns a 64-bit seed as the two words of a generator's key."""
     seed = checks.integer("seed", seed, 0, 2**64 - 1)
     return dict(key0=seed & 0xFFFFFFFF, key1=seed >> 32)
-
-
-def texel_bits(
-    scenery: Scenery, name: str, bits: torch.Tensor, axes: tuple[int, ...]
-) -> tuple[int, int]:
-    """Returns the address and ``n_words`` of a tensor (*axes, n_words) of a scenery's texels."""
-    min_words = -(-scenery.layouts.max_texels // 32)
-    n_words = checks.length(name, bits, axis=-1)
-    if n_words < min_words:
-        raise ValueError(
-            f"{name} must have a bit for each of a layout's texels, so at least {min_words} words, "
-            f"but it has {n_words}"
-        )
-    address = checks.address(name, bits, (*axes, n_words), torch.int32, scenery.device)
-    return address, n_words

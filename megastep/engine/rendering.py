@@ -15,7 +15,6 @@ from megastep.engine.launch_params import (
     lanes_of,
     object_params,
     state_params,
-    texel_bits,
     world_params,
 )
 from megastep.engine.operations import update_objects
@@ -29,16 +28,6 @@ LINE_BYTES = 16
 #: Agents are many if they need more threads than this many times those that a GPU runs at once, by
 #: what is faster on an H200.
 UNSPILLED_WAVES = 4
-
-# RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.
-_OPTIONAL = dict.fromkeys(
-    (
-        *("indices", "locations", "dots", "distances", "screen"),
-        *("rgb", "depth", "centre_line", "agent_ray", "velocity", "angvelocity", "imu"),
-        *("seen", "clear_mask", "newly_seen", "n_words"),
-    ),
-    0,
-)
 
 
 class Render(NamedTuple):
@@ -60,6 +49,16 @@ class Observation(NamedTuple):
     agent_ray: torch.Tensor | None  # (N, A, C) int32: ray closest to the centre that hits an agent
     imu: torch.Tensor | None  # (N, A, 3) fp16: angvelocity / 360, own velocity ahead and left / 10
     newly_seen: torch.Tensor | None  # (N, A) int32: texels newly marked in `seen`
+
+
+#: RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.
+_OPTIONAL = dict.fromkeys(
+    (
+        *(*Render._fields, *Observation._fields),
+        *("velocity", "angvelocity", "seen", "clear_mask", "n_words"),
+    ),
+    0,
+)
 
 
 def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) -> None:
@@ -127,7 +126,9 @@ def observe(
         checks.flag(name, value)
     seen_fields = {}
     if seen is not None:
-        address, n_words = texel_bits(scenery, "seen", seen, lanes)
+        n_words, at_least = checks.length("seen", seen, -1), -(-scenery.layouts.max_texels // 32)
+        checks.integer("the last axis of seen, words of 32 texels,", n_words, at_least)
+        address = checks.address("seen", seen, (*lanes, n_words), torch.int32, device)
         mask = checks.optional("clear_mask", clear_mask, lanes, torch.bool, device)
         seen_fields = dict(seen=address, n_words=n_words, clear_mask=mask)
     elif clear_mask is not None:

@@ -11,6 +11,8 @@ HD int mini(int a, int b) { return a < b ? a : b; }
 
 HD int maxi(int a, int b) { return a > b ? a : b; }
 
+HD int within(int i, int max) { return mini(maxi(i, 0), max); }
+
 HD float clamp(float x, float min, float max) { return minf(maxf(x, min), max); }
 
 HD float mix(float a, float b, float weight) { return a + weight * (b - a); }

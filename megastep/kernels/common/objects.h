@@ -68,8 +68,7 @@ struct Lines {
 };
 
 HD Lines lines_of(const ObjectsParams& o, int k) {
-    int end = o.line_starts[k + 1];
-    return {maxi(o.line_starts[k], 0), mini(end, o.n_lines)};
+    return {within(o.line_starts[k], o.n_lines), within(o.line_starts[k + 1], o.n_lines)};
 }
 
 // Line l of an environment's objects, one of this object at a pose.

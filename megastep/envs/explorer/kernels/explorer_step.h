@@ -37,7 +37,7 @@ struct Runs {
 };
 
 HD Runs runs_of(const ExplorerStepParams& p, int layout) {
-    return {maxi(p.run_starts[layout], 0), mini(p.run_starts[layout + 1], p.n_runs)};
+    return {within(p.run_starts[layout], p.n_runs), within(p.run_starts[layout + 1], p.n_runs)};
 }
 
 // The texels of a run that an agent has not seen yet, of whose words `last` is the last.

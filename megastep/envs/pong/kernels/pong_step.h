@@ -171,13 +171,13 @@ struct Image {
 };
 
 HD int pixel_at(int x, int y, int side) {
-    x = between(x, 0, WIDTH - 1);
+    x = within(x, WIDTH - 1);
     int column = (side ? WIDTH - 1 - x : x) / CELL;
-    return between(y, 0, HEIGHT - 1) / CELL * COLUMNS + column;
+    return within(y, HEIGHT - 1) / CELL * COLUMNS + column;
 }
 
 HD Image image_of(const Game& g, int side) {
-    int own = between(g.top[side], 0, MAX_TOP), other = between(g.top[1 - side], 0, MAX_TOP);
+    int own = within(g.top[side], MAX_TOP), other = within(g.top[1 - side], MAX_TOP);
     return {own / CELL, other / CELL, pixel_at(g.x, g.y, side), pixel_at(g.last_x, g.last_y, side)};
 }
 
