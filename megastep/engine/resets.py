@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from megastep.arrdict import arrdict
     from megastep.types import Env
 
-__all__ = ["Resets"]
 
 Integers = TypeVar("Integers", int, torch.Tensor)
 COUNTERS = "counts", "n_draws"  # attributes that count a generator's draws

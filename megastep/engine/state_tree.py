@@ -11,17 +11,6 @@ import torch
 
 from megastep.read_only import ReadOnlyTensor
 
-__all__ = [
-    "children",
-    "is_expanded",
-    "node_at",
-    "rebind",
-    "restore",
-    "snapshot",
-    "state_tree",
-    "walk",
-]
-
 State = dict[str, torch.Tensor]
 
 SCALARS = (bool, int, float, str, type(None))

@@ -19,8 +19,6 @@ from megastep.modules.spawning import MAX_SPAWNS, cached_points
 from megastep.ragged import RaggedNumpy
 from megastep.scene import linear
 
-__all__ = ["COLOURS", "Crate", "Disc", "Door", "Kind", "Objects", "doorways"]
-
 #: Names of the colours, and the colours in sRGB. Each differs from the others in any light, and its
 #: weakest channel has less of its light than any wall's.
 COLOURS = {

@@ -9,8 +9,6 @@ from megastep.engine import checks
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import ENGINE
 
-__all__ = ["visible_texels"]
-
 CAMERAS = (0.0, 120.0, 240.0)  # yaw of each, degrees
 FOV = 122.0  # degrees; neighbouring cameras overlap by two
 RES = 512  # rays per camera

@@ -37,13 +37,18 @@ class Episodes(NamedTuple):
     doors: np.ndarray  # (D, M, K) int32: OPEN, a colour, or C
 
 
+def doors_of(g: dotdict) -> np.ndarray:
+    """Returns the segments (K, 2, 2) across a home's doorways."""
+    return np.reshape(g.get("doors", ()), (-1, 2, 2))
+
+
 class Areas:
     """The areas of a home: ``labels`` (H, W), of each cell from 1, 0 where a wall or doorway is;
     ``sides`` (K, 2), those beside each doorway, 0 if there is none.
     """
 
     def __init__(self, g: dotdict):
-        doors = np.reshape(g.get("doors", ()), (-1, 2, 2))
+        doors = doors_of(g)
         blocked = geometry.masks(np.concatenate([g.walls, doors]), [], RES)[::-1] < 0
         self.labels, _ = geometry.components(~blocked)
         along = doors[:, 1] - doors[:, 0]
@@ -75,7 +80,7 @@ def episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -
     """Returns n random episodes of each geometry, with up to `n_colours` shut doors. ValueError if
     no geometry has a doorway between two of its areas, or one has no room.
     """
-    n_doors = max(len(np.reshape(g.get("doors", ()), (-1, 2, 2))) for g in geometries)
+    n_doors = max(len(doors_of(g)) for g in geometries)
     found = per_geometry(
         geometries, seed, lambda g, random: _episodes(g, n, n_colours, n_doors, random)
     )
@@ -91,9 +96,8 @@ def episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -
 
 
 def _episodes(g, n, n_colours, n_doors, random) -> tuple[np.ndarray, ...]:
-    areas = Areas(g)
+    areas, doors = Areas(g), doors_of(g)
     points = next(candidates(g, N_POINTS, random))
-    doors = np.reshape(g.get("doors", ()), (-1, 2, 2))
     is_clear = distances(points, g.walls) > 0.15 + CLEARANCE
     points = points[is_clear & (distances(points, doors) > APART)]
     of_point = areas.at(points)

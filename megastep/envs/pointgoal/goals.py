@@ -2,9 +2,9 @@
 goals per layout, H x W cells.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +16,6 @@ from megastep.geodesics import Geodesics
 from megastep.geometry import contents
 from megastep.kernels.build.kernel_library import KERNELS
 from megastep.modules import spawning
-
-T = TypeVar("T")
 
 PREFIX = "geodesics-"  # of the cached files
 MAX_FILES, MAX_BYTES = 64, 10**9  # of all cached files together
@@ -125,8 +123,7 @@ def all_geodesics(
     geometries: Sequence[dotdict], radius: float, seed: int, device: torch.device | str = "cpu"
 ) -> list[Geodesics]:
     """Returns the geodesics of each geometry, the same on any device. A GPU computes them in less
-    time than a file takes to read. A CPU takes some seconds for 512 homes: it shows a progress bar
-    and caches them.
+    time than a file takes to read; a CPU takes some seconds for 512 homes, and caches them.
     """
     distinct = list({id(g): g for g in geometries}.values())
     generators = [np.random.Generator(np.random.Philox([seed, d])) for d in range(len(distinct))]
@@ -141,7 +138,13 @@ def _cached(found, geometries, radius, seed) -> list[Geodesics]:
     """Returns the list of what the iterator `found` yields, from the cache if it holds it."""
 
     def build() -> dict[str, np.ndarray]:
-        layouts = list(_with_progress(found, len(geometries)))
+        from rich.console import Console
+        from rich.progress import track
+
+        n = len(geometries)
+        description = f"Computing the shortest paths in {n:,} layouts"
+        bar: dict = dict(console=Console(stderr=True), disable=n < MIN_PROGRESS)
+        layouts = list(track(found, description, n, **bar))
         rest = [name for name in Geodesics._fields if name != "fields"]
         arrays = {name: np.stack([getattr(layout, name) for layout in layouts]) for name in rest}
         shapes = np.array([layout.fields.shape for layout in layouts])
@@ -155,14 +158,3 @@ def _cached(found, geometries, radius, seed) -> list[Geodesics]:
     shaped = [field.reshape(shape) for field, shape in zip(fields, shapes)]
     rest = [dict(zip(arrays, values)) for values in zip(*arrays.values())]
     return [Geodesics(fields=field, **parts) for field, parts in zip(shaped, rest, strict=True)]
-
-
-def _with_progress(items: Iterable[T], total: int) -> Iterable[T]:
-    """Returns an iterator over `items` that shows a progress bar on stderr, if they are many."""
-    if total < MIN_PROGRESS:
-        return items
-    from rich.console import Console
-    from rich.progress import track
-
-    description = f"Computing the shortest paths in {total:,} layouts"
-    return track(items, description, total, console=Console(stderr=True))

@@ -24,11 +24,6 @@ from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLib
 if TYPE_CHECKING:
     from ctypes import CDLL
 
-__all__ = [
-    *("EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"),
-    *("wasm", "wasm_key", "wasm_keys", "wasm_tools"),
-]
-
 
 class EngineError(RuntimeError):
     """The engine cannot go on, for example without a compiler, GPU or enough memory, or with a NaN

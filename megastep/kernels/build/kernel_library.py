@@ -18,11 +18,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-__all__ = [
-    *("CPU_FLAGS", "CUDA_FLAGS", "FAST_CUDA_FLAGS", "KERNELS", "SCALAR_WASM_FLAGS", "WASM_FLAGS"),
-    *("KernelLibrary", "Word", "operations"),
-]
-
 #: The folder of the engine's kernels. Its headers in ``common/`` are for all kernel libraries.
 KERNELS = Path(__file__).parents[1]
 #: The C++ compiler's flags. No fused multiply-adds, as below.

@@ -11,8 +11,6 @@ import torch
 from megastep.kernels.build.compile import EngineError, bindings, check_status, cpu, cuda
 from megastep.kernels.build.kernel_library import KERNELS, KernelLibrary
 
-__all__ = ["ENGINE", "Blocks", "launch", "observed", "without_early_starts"]
-
 #: The engine's operations.
 ENGINE = KernelLibrary(KERNELS)
 BLOCK = ENGINE.constants["BLOCK"]  # threads per block
