@@ -118,10 +118,11 @@ def check_flag(error_flag: torch.Tensor, objects: Objects | None = None) -> None
         return
     error_flag.zero_()
     index, number = divmod(flag, ENGINE.constants["ERROR_KINDS"])
-    kinds = [kind for kind in (*_MESSAGES, *_OF_OBJECTS) if ENGINE.constants[kind] == number]
-    kind = kinds[0] if kinds else "NONFINITE"
-    if kind in _MESSAGES or objects is None:
-        raise EngineError(_MESSAGES.get(kind, "{env}").format(env=index))
+    kind = {ENGINE.constants[kind]: kind for kind in (*_MESSAGES, *_OF_OBJECTS)}.get(number)
+    if kind in _MESSAGES:
+        raise EngineError(_MESSAGES[kind].format(env=index))
+    if kind is None or objects is None:
+        raise EngineError(f"The error flag holds {flag}, which no kernel writes.")
     env, k = divmod(index, objects.n_objects)
     raise EngineError(f"In environment {env}, {objects.names[k]} {_OF_OBJECTS[kind]}.")
 

@@ -1,6 +1,5 @@
 """A base of environments in which agents walk through a floor plan and see by cameras."""
 
-import inspect
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -78,17 +77,6 @@ class FirstPerson(SceneryEnv):
     source = "homes"
     #: Steps after which an episode is truncated.
     limit: int
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Gives a constructor's signature, which settings are made from, the arguments above."""
-        super().__init_subclass__(**options)
-        init: Any = cls.__init__
-        own = inspect.signature(init).parameters
-        if "shared" in own:
-            named = {**inspect.signature(FirstPerson.__init__).parameters}
-            named |= {name: one for name, one in own.items() if one.kind is one.KEYWORD_ONLY}
-            init.__signature__ = inspect.Signature([*named.values()])
-            init.__annotations__ = FirstPerson.__init__.__annotations__ | init.__annotations__
 
     @checked
     def __init__(

@@ -13,6 +13,7 @@ from megastep.engine.state_tree import state_tree
 from megastep.envs import PointGoal
 from megastep.envs.first_person import images
 from megastep.geometries import sample
+from megastep.kernels.build.launch import ENGINE
 from tests.helpers.synchronisation import no_synchronisation
 
 GPU = torch.cuda.is_available()
@@ -316,9 +317,8 @@ def test_check_raises_errors_flagged_on_the_device(name, device):
     env.reset()
     env.check()
     if device == "cpu":  # operations on the CPU raise at once, so set the flag by hand
-        flags = {path: leaf for path, leaf in state_tree(env).items() if "error_flag" in path}
-        (flag,) = [leaf for path, leaf in flags.items() if "objects" not in path]
-        flag.fill_(8 * 3 + 1)
+        (flag,) = [leaf for path, leaf in state_tree(env).items() if "error_flag" in path]
+        flag.fill_(3 * ENGINE.constants["ERROR_KINDS"] + 1)
     else:
         env.step(idle(env).map(torch.add, math.nan if is_continuous(env) else 7))
     with pytest.raises(EngineError, match="nvironment"):

@@ -78,11 +78,7 @@ class Deathmatch(FirstPerson):
         ``accuracy``: fraction of steps with a hit.
 
     Args:
-        n_envs: number of environments.
-        geometries: floor plans. Default: generated homes.
         n_agents: agents per environment.
-        seed: of textures, spawns and generated homes.
-        device: default: a GPU if there is one.
         damage: health that a hit costs its target.
         recovery: health regained per second without a wound.
         drain: health lost per second.
@@ -100,10 +96,6 @@ class Deathmatch(FirstPerson):
         search_reward: reward per 64 wall texels seen for the first time in the episode, as in
             Explorer.
         hearing: metres at which the sound of another agent fades. 0: agents are deaf.
-        res: rays of an agent's camera.
-        subsample: rays per pixel.
-        fov: field of view in degrees.
-        fps: steps per second.
         resample: play in rounds of ``limit`` steps. At their end every episode in the environment
             is truncated, and the next round is in a randomly drawn home. Otherwise an environment
             keeps its own.
