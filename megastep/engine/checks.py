@@ -1,6 +1,5 @@
 """Checks of arguments. Their errors name the argument, what is allowed and what was given."""
 
-import contextlib
 import math
 import numbers
 import operator
@@ -27,10 +26,12 @@ def _refuse(name, wanted, value, kind: type[Exception] = ValueError) -> NoReturn
 
 def integer(name: str, value: object, min: int, max: float = math.inf) -> int:
     """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
-    with contextlib.suppress(TypeError, RuntimeError, ValueError):
+    try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]
         if min <= number <= max and not isinstance(value, bool):
             return number
+    except (TypeError, RuntimeError, ValueError):
+        pass
     range_ = f"from {min} to {max}" if max < math.inf else f"of at least {min}"
     _refuse(name, f"an integer {range_}", value)
 

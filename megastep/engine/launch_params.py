@@ -27,20 +27,16 @@ class _Cached:
         self.key, self.value = key, value
 
 
-def _cached(owner, key, pack) -> bytes:
-    """Returns the struct that ``pack()`` returns, again only if the key is another."""
-    cached = vars(owner).get("_packed")
-    if cached is None or cached.key != key:
-        cached = vars(owner)["_packed"] = _Cached(key, pack())
-    return cached.value
-
-
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
     """Returns the packed SceneryParams of a scenery. Its tensors cannot be replaced."""
     n_threads = devices.threads()
     # a copy's tensors lie elsewhere
     key = _address(scenery.layout), _address(scenery.layouts.texels), radius, n_threads
-    return _cached(scenery, key, lambda: _pack_scenery(scenery, radius, n_threads))
+    packed = vars(scenery).get("_packed")
+    if packed is None or packed.key != key:
+        packed = _Cached(key, _pack_scenery(scenery, radius, n_threads))
+        vars(scenery)["_packed"] = packed
+    return packed.value
 
 
 def _pack_scenery(scenery, radius, n_threads) -> bytes:
@@ -79,19 +75,18 @@ def object_params(scenery: Scenery) -> bytes:
     o = scenery.objects
     if o is None:
         return _NO_OBJECTS
-    key = _address(o.records), _address(o.palette)
-    return _cached(o, key, lambda: _pack_objects(o, scenery.layouts.extents))
-
-
-def _pack_objects(o, extents) -> bytes:
-    tensors = "shapes", "line_starts", "line_object", "palette", "lines", "texels", "ends"
-    return ENGINE.params.ObjectsParams(
-        **{name: getattr(o, name) for name in (*tensors, "n_objects", "n_colours")},
-        extents=extents,
-        objects=o.records,
-        n_lines=len(o.line_object),
-        lit=int(o.lit),
-    )
+    key, packed = (_address(o.records), _address(o.palette)), vars(o).get("_packed")
+    if packed is None or packed.key != key:
+        same = "shapes", "line_starts", "line_object", "palette", "lines", "texels", "ends"
+        struct = ENGINE.params.ObjectsParams(
+            **{name: getattr(o, name) for name in (*same, "n_objects", "n_colours")},
+            extents=scenery.layouts.extents,
+            objects=o.records,
+            n_lines=len(o.line_object),
+            lit=int(o.lit),
+        )
+        packed = vars(o)["_packed"] = _Cached(key, struct)
+    return packed.value
 
 
 def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int]:

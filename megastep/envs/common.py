@@ -57,8 +57,7 @@ def judged(
     Returns its :func:`step_outputs`; those of a critic are None unless ``env.privileged_space``.
     """
     core, n_lanes = env.core, env.n_envs * env.n_agents
-    is_wanted = env.privileged_space is not None
-    critic = {name: size * is_wanted for name, size in critic.items()}
+    critic = dict.fromkeys(critic, 0) if env.privileged_space is None else critic
     outputs = step_outputs(env, n_metrics, obs, critic)
     launch(
         *(library, operation, env.device, n_threads or n_lanes),
@@ -79,9 +78,8 @@ def world_of(outputs: Mapping, obs: Any, metrics: Sequence[str], **critic: str) 
     world = arrdict(obs=obs, **{name: outputs[name] for name in ("reward", *FLAGS)})
     if outputs["metrics"] is not None:
         world["metrics"] = arrdict(zip(metrics, outputs["metrics"].unbind()))
-    seen = {name: outputs[output] for name, output in critic.items()}
-    if any(tensor is not None for tensor in seen.values()):
-        world["privileged"] = arrdict(seen)
+    if critic and outputs[next(iter(critic.values()))] is not None:
+        world["privileged"] = arrdict({name: outputs[key] for name, key in critic.items()})
     return world
 
 

@@ -1,5 +1,6 @@
 """A base of environments in which agents walk through a floor plan and see by cameras."""
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -27,11 +28,10 @@ def images(view: engine.Observation) -> arrdict:
     observation's tensors: an image has a row per camera.
     """
     rgb, d = view.rgb, view.depth
-    assert rgb is not None and d is not None
-    if rgb.ndim == 4:  # one camera
-        rgb, d = rgb.unsqueeze(2), d.unsqueeze(2)
-    by_agent = arrdict(rgb=rgb.transpose(2, 3), d=d.unsqueeze(2), imu=view.imu)
-    return by_agent.map(lambda leaf: leaf.flatten(0, 1).unsqueeze(1))
+    assert rgb is not None and d is not None and view.imu is not None
+    lanes, pixels = (d.shape[0] * d.shape[1], 1), d.shape[-1]
+    rgb = rgb.view(*lanes, -1, 3, pixels).transpose(2, 3)
+    return arrdict(rgb=rgb, d=d.view(*lanes, 1, -1, pixels), imu=view.imu.view(*lanes, 3))
 
 
 class FirstPerson(SceneryEnv):
@@ -77,6 +77,17 @@ class FirstPerson(SceneryEnv):
     source = "homes"
     #: Steps after which an episode is truncated.
     limit: int
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Gives a constructor's signature, which settings are made from, the arguments above."""
+        super().__init_subclass__(**options)
+        init: Any = cls.__init__
+        own = inspect.signature(init).parameters
+        if "shared" in own:
+            named = {**inspect.signature(FirstPerson.__init__).parameters}
+            named |= {name: one for name, one in own.items() if one.kind is one.KEYWORD_ONLY}
+            init.__signature__ = inspect.Signature([*named.values()])
+            init.__annotations__ = FirstPerson.__init__.__annotations__ | init.__annotations__
 
     @checked
     def __init__(

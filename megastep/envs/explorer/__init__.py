@@ -41,6 +41,7 @@ class TexelRuns(NamedTuple):
     runs: torch.Tensor | None = None
     run_starts: torch.Tensor | None = None  # (D + 1,) int32, first run of each layout
     n_visible: torch.Tensor | None = None  # (D,) int32, visible texels of each layout
+    n_runs: int = 0  # S
 
 
 NO_RUNS = TexelRuns()
@@ -75,7 +76,7 @@ def texel_runs(scenery: Scenery, visible: torch.Tensor) -> TexelRuns:
     n_visible.index_add_(0, layout, n_bits)
     starts = torch.cat([n_runs.new_zeros(1), n_runs.cumsum(0)])
     tensors = table.contiguous(), starts.int(), n_visible.int()
-    return TexelRuns(*(tensor.to(device) for tensor in tensors))
+    return TexelRuns(*(tensor.to(device) for tensor in tensors), len(table))
 
 
 def _as_signed(bits) -> torch.Tensor:
@@ -149,15 +150,14 @@ class Explorer(FirstPerson):
 
     def _judge(self, newly_seen) -> dict:
         """Rewards agents for the texels (N, A) int32 that they have newly seen."""
-        runs, n_lanes = self.runs or NO_RUNS, len(self.ended)
+        n_lanes = len(self.ended)
         return judged(
             *(self, LIBRARY, "explorer_step", int(self.has_metrics)),
             *({}, dict(episode=N_EPISODE, unseen=N_BINS)),
             n_threads=n_lanes if self.privileged_space is None else n_lanes * WARP,
             newly_seen=newly_seen,
             seen=self.seen,
-            **runs._asdict(),
-            n_runs=0 if runs.runs is None else len(runs.runs),
+            **(self.runs or NO_RUNS)._asdict(),
             limits=self.limits,
             n_words=self.seen.shape[-1],
             patience=self.patience,
