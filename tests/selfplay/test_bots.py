@@ -14,11 +14,10 @@ from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing, statistics
 from megastep.agents.evaluation.playing import first_episodes
 from megastep.agents.selfplay.bots import BOTS
-from megastep.agents.selfplay.bots.hunter import Hunter
 from megastep.agents.selfplay.bots.plans import Plans
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.agents.selfplay.bots.seekers import Mapper, Oracle, Wanderer
-from megastep.agents.selfplay.bots.walker import Explorer, Walker
+from megastep.agents.selfplay.bots.walker import Explorer, Hunter, Walker
 from megastep.arrdict import arrdict
 from megastep.geometries import sample
 from megastep.modules.spawning import distances

@@ -8,7 +8,7 @@ opponents and baselines, not competitors.
 #: Import paths by the short names that `against=` and `opponents.bot_class=` take.
 BOTS = {
     "explorer": "megastep.agents.selfplay.bots.walker:Explorer",
-    "hunter": "megastep.agents.selfplay.bots.hunter:Hunter",
+    "hunter": "megastep.agents.selfplay.bots.walker:Hunter",
     "mapper": "megastep.agents.selfplay.bots.seekers:Mapper",
     "oracle": "megastep.agents.selfplay.bots.seekers:Oracle",
     "random": "megastep.agents.selfplay.bots.random:RandomActions",
