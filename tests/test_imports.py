@@ -157,7 +157,7 @@ OUTSIDE_USERS = {
     ),
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/evaluation/ratings.py",),
-    "pettingzoo": ("megastep/adapters/parallel_env.py", "megastep/hosting/parallel.py"),
+    "pettingzoo": ("megastep/adapters/parallel_env.py", "megastep/hosting/hosted.py"),
     "rich": ("agents/console.py", "megastep/envs/pointgoal/goals.py"),
     "rsl_rl": ("megastep/adapters/rsl_rl.py",),
     "shapely": ("megastep/geometries/plans/*.py",),

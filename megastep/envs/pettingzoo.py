@@ -54,7 +54,7 @@ class PettingZoo(VectorizedEnv):
                 "env.id=pettingzoo.sisl.multiwalker_v9:parallel_env"
             )
         try:
-            from megastep.hosting.parallel import ParallelEnvs
+            from megastep.hosting.hosted import ParallelEnvs
         except ImportError:
             raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
         make, functions = import_object(id), [import_object(name) for name in wrappers]
