@@ -110,19 +110,30 @@ def table(
     """Returns a table as text: in Markdown, or in characters that stdout can show.
 
     Args:
-        width: in characters, for which cells are broken.
+        width: in characters. The last columns are left out until it fits, and a line below names
+            them. The first two stay.
     """
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    style = box.HEAVY_HEAD if is_unicode() else box.ASCII
-    grid, text = Table(*head, box=box.MARKDOWN if is_markdown else style), StringIO()
-    for row in rows:
-        grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
-    plain: dict = dict(markup=False, emoji=False, color_system=None)
-    Console(file=text, width=width or 10_000, force_terminal=False, **plain).print(grid)
-    return text.getvalue().strip()
+    def shown(n, width=10_000) -> str:
+        style = box.HEAVY_HEAD if is_unicode() else box.ASCII
+        grid, text = Table(*head[:n], box=box.MARKDOWN if is_markdown else style), StringIO()
+        for row in rows:
+            grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row[:n]))
+        plain: dict = dict(markup=False, emoji=False, color_system=None)
+        Console(file=text, width=width, force_terminal=False, **plain).print(grid)
+        return text.getvalue().strip()
+
+    n = len(head)
+    text = shown(n)
+    while width and n > 2 and max(map(len, text.splitlines())) > width:
+        n -= 1
+        text = shown(n, width if n == 2 else 10_000)  # whose cells are broken if they must be
+    if n == len(head):
+        return text
+    return f"{text}\nToo wide for this terminal, but in the file: {', '.join(head[n:])}"
 
 
 def terminal_width() -> int | None:
