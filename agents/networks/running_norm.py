@@ -229,19 +229,7 @@ def masked_moments(valid: torch.Tensor, *arrays: torch.Tensor) -> list[Moments]:
     return moments
 
 
-def _normalise_on_gpu(x, valid, moments) -> torch.Tensor:
-    _, mean, variance = moments
-    normalised = torch.empty_like(x)
-    launch(
-        *(LIBRARY, "normalise_masked", x.device, x.numel()),
-        **dict(values=x, valid=valid, mean=mean, variance=variance),
-        **dict(normalised=normalised, n=x.numel()),
-    )
-    return normalised
-
-
 @torch.no_grad()
-@fused(_normalise_on_gpu, lambda x, valid, moments: _are_masked_readable(valid, x))
 def normalise_masked(x: torch.Tensor, valid: torch.Tensor, moments: Moments) -> torch.Tensor:
     """Returns x minus the mean, divided by the standard deviation; 0 where invalid."""
     _, mean, variance = moments

@@ -2,7 +2,7 @@
 // and whether a step is taken. A block handles neighbouring numbers of one parameter, a thread a
 // word of four.
 #include "common/constants.h"
-#include "common/dependent_launch.h"
+#include "common/rows.h"
 #include "constants.h"
 #include "params.h"
 
@@ -21,11 +21,7 @@ struct WordIndex {
 };
 
 DEVICE WordIndex find_index(const AdamRowParams* rows, int n_rows) {
-    int row = 0, end = n_rows;  // the last row that begins at or before this block
-    while (end - row > 1) {
-        int middle = (row + end) / 2;
-        (rows[middle].first_block <= blockIdx.x ? row : end) = middle;
-    }
+    int row = row_of_block(rows, n_rows);
     const AdamRowParams& its = rows[row];
     unsigned int at = 4 * ((blockIdx.x - its.first_block) * ADAM_THREADS + threadIdx.x);
     int n = at < its.n ? (int)min(its.n - at, 4u) : 0;

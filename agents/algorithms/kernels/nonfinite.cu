@@ -81,34 +81,23 @@ DEVICE float size_of(const CheckedTensorParams& tensor, long long row) {
     return fabsf(size);
 }
 
-// The sum of a number over a block, in every thread.
-DEVICE int sum_of_block(int x) {
-    __shared__ int of_warps[RECORD_THREADS / WARP];
-    x = __reduce_add_sync(~0u, x);
-    __syncthreads();
-    if (threadIdx.x % WARP == 0)
-        of_warps[threadIdx.x / WARP] = x;
-    __syncthreads();
-    return __reduce_add_sync(~0u, of_warps[threadIdx.x % WARP]);
-}
-
 // One block. Counts the rollout, and keeps its first bad number, that of the smallest row and lane,
 // unless an earlier rollout's is still there.
 KERNEL BOUNDS(1024) record(RecordParams p) {
     wait_for_previous();
     __shared__ unsigned long long first;
-    if (!threadIdx.x)
+    __shared__ int n_bad;
+    if (!threadIdx.x) {
         first = ~0ull;
-    int n_rows = p.n_steps * p.n_tensors, n_bad = 0;
-    unsigned long long index = ~0ull;
+        n_bad = 0;
+    }
+    __syncthreads();
+    int n_rows = p.n_steps * p.n_tensors;
     for (int lane = threadIdx.x; lane < p.n_lanes; lane += RECORD_THREADS)
-        if (p.first_rows[lane] < n_rows) {
-            n_bad++;
-            index = min(index, (unsigned long long)p.first_rows[lane] * p.n_lanes + lane);
+        if (p.first_rows[lane] < n_rows) {  // there are few
+            atomicAdd(&n_bad, 1);
+            atomicMin(&first, (unsigned long long)p.first_rows[lane] * p.n_lanes + lane);
         }
-    n_bad = sum_of_block(n_bad);
-    if (index != ~0ull)
-        atomicMin(&first, index);
     __syncthreads();
     if (threadIdx.x)
         return;

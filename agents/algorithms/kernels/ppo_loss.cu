@@ -1,7 +1,6 @@
 // PPO's loss, with its gradients and metrics, all means over valid rows. One thread per row; a
 // block adds up its rows in a fixed order, the caller the blocks.
-#include "common/constants.h"
-#include "common/dependent_launch.h"
+#include "block_sums.h"
 #include "constants.h"
 #include "params.h"
 
@@ -52,18 +51,5 @@ KERNEL ppo_loss(PpoLossParams p) {
         if (p.errors)
             p.d_errors[row] = auxiliary_coef * weight;
     }
-    __shared__ float of_warps[BLOCK / WARP][N_SUMS];
-    for (int i = 0; i < N_SUMS; i++) {
-        for (int mask = WARP / 2; mask; mask /= 2)
-            sums[i] += __shfl_xor_sync(~0u, sums[i], mask);
-        if (threadIdx.x % WARP == 0)
-            of_warps[threadIdx.x / WARP][i] = sums[i];
-    }
-    __syncthreads();
-    if (threadIdx.x < N_SUMS) {
-        float total = 0.f;
-        for (int warp = 0; warp < BLOCK / WARP; warp++)
-            total += of_warps[warp][threadIdx.x];
-        p.sums[blockIdx.x * N_SUMS + threadIdx.x] = total;
-    }
+    add_up<BLOCK>(sums, p.sums + blockIdx.x * N_SUMS);
 }

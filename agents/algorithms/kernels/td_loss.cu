@@ -1,12 +1,10 @@
 // R2D2's loss with its gradient, priorities and metrics. A block handles a few sequences, a thread
 // every N-th step of one of them; the block adds up in a fixed order.
-#include "common/constants.h"
-#include "common/dependent_launch.h"
+#include "block_sums.h"
 #include "constants.h"
 #include "params.h"
 
 constexpr int PHASES = TD_THREADS / TD_SEQUENCES;  // threads of a sequence
-constexpr int TD_WARPS = TD_THREADS / WARP;
 
 DEVICE float sign(float x) { return (float)((x > 0.f) - (x < 0.f)); }
 
@@ -55,7 +53,7 @@ DEVICE float n_step_return(const TdLossParams& p, int t, int sequence) {
 KERNEL td_loss(TdLossParams p) {
     wait_for_previous();
     __shared__ float largest[PHASES][TD_SEQUENCES], sizes[PHASES][TD_SEQUENCES];
-    __shared__ float counts[PHASES][TD_SEQUENCES], of_warps[TD_WARPS][N_TD_SUMS];
+    __shared__ float counts[PHASES][TD_SEQUENCES];
     int phase = threadIdx.x / TD_SEQUENCES, of_block = threadIdx.x % TD_SEQUENCES;
     int sequence = blockIdx.x * TD_SEQUENCES + of_block, n_outputs = p.n_agents * p.n_choices;
     bool exists = sequence < p.n_sequences;
@@ -100,19 +98,7 @@ KERNEL td_loss(TdLossParams p) {
     largest[phase][of_block] = size;
     sizes[phase][of_block] = sums[1];
     counts[phase][of_block] = sums[3];
-    for (int i = 0; i < N_TD_SUMS; i++) {
-        for (int mask = WARP / 2; mask; mask /= 2)
-            sums[i] += __shfl_xor_sync(~0u, sums[i], mask);
-        if (threadIdx.x % WARP == 0)
-            of_warps[threadIdx.x / WARP][i] = sums[i];
-    }
-    __syncthreads();
-    if (threadIdx.x < N_TD_SUMS) {
-        float total = 0.f;
-        for (int warp = 0; warp < TD_WARPS; warp++)
-            total += of_warps[warp][threadIdx.x];
-        p.sums[blockIdx.x * N_TD_SUMS + threadIdx.x] = total;
-    }
+    add_up<TD_THREADS>(sums, p.sums + blockIdx.x * N_TD_SUMS);
     if (exists && !phase) {
         float sum = 0.f, count = 0.f;
         for (int i = 0; i < PHASES; i++) {

@@ -1,5 +1,6 @@
 // Rounds weights to bfloat16, many in one launch, with zeros after each. A thread writes a word of
 // eight numbers.
+#include "common/rows.h"
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -8,12 +9,7 @@ static_assert(sizeof(CastParams::rows) == CAST_ROWS * sizeof(CastRowParams));
 
 KERNEL BOUNDS(256) cast(CastParams p) {
     wait_for_previous();
-    int row = 0, end = p.n_rows;  // the last row that begins at or before this block
-    while (end - row > 1) {
-        int middle = (row + end) / 2;
-        (p.rows[middle].first_block <= blockIdx.x ? row : end) = middle;
-    }
-    const CastRowParams& its = p.rows[row];
+    const CastRowParams& its = p.rows[row_of_block(p.rows, p.n_rows)];
     unsigned int at = 8 * ((blockIdx.x - its.first_block) * CAST_THREADS + threadIdx.x);
     if (at >= its.n_padded)
         return;

@@ -1,5 +1,5 @@
-// Means and variances of the valid ones of many numbers, such as returns; normalisation by them;
-// and adding those of returns to the critic's (PopArt). Blocks along y: arrays.
+// Means and variances of the valid ones of many numbers, such as returns; and adding those of
+// returns to the critic's (PopArt). Blocks along y: arrays.
 #include "block_sum.h"
 #include "constants.h"
 #include "lanes.h"
@@ -63,15 +63,6 @@ KERNEL BOUNDS(256) masked_moments(MaskedMomentsParams p) {
     p.moments[2 * blockIdx.y + 1] = (float)(squares / n);
     if (!blockIdx.y)
         *p.n_valid = (long long)count;
-}
-
-KERNEL normalise_masked(NormaliseMaskedParams p) {
-    wait_for_previous();
-    int at = blockIdx.x * blockDim.x + threadIdx.x;
-    if (at >= p.n)
-        return;
-    float away = p.values[at] - *p.mean;
-    p.normalised[at] = p.valid[at] ? __fdiv_rn(away, sqrtf(*p.variance) + 1e-30f) : 0.f;
 }
 
 // Changes nothing if no return is valid, if a number is not finite, or if all returns have been 0.

@@ -147,15 +147,6 @@ struct MaskedMomentsParams {
     int n_parts;
 };
 
-struct NormaliseMaskedParams {
-    const float* values;         // (n)
-    const unsigned char* valid;  // (n)
-    const float* mean;           // ()
-    const float* variance;       // ()
-    float* normalised;           // (n), 0 where invalid
-    int n;
-};
-
 // The critic's last layer, and the statistics of returns that it predicts in.
 struct AddReturnsParams {
     float* weight;                    // (W)

@@ -1,6 +1,6 @@
 // Copies many pieces of memory in one launch. A block copies neighbouring words of one piece.
 #include "common/constants.h"
-#include "common/dependent_launch.h"
+#include "common/rows.h"
 #include "constants.h"
 #include "params.h"
 
@@ -12,12 +12,7 @@ KERNEL copy_all(CopyAllParams p) {
     wait_for_previous();
     if (p.condition && !*p.condition)
         return;
-    int piece = 0, end = p.n_copies;  // the last one that begins at or before this block
-    while (end - piece > 1) {
-        int middle = (piece + end) / 2;
-        (p.copies[middle].first_block <= blockIdx.x ? piece : end) = middle;
-    }
-    const CopyParams& copy = p.copies[piece];
+    const CopyParams& copy = p.copies[row_of_block(p.copies, p.n_copies)];
     unsigned int block = blockIdx.x - copy.first_block;
     unsigned int n_blocks = (copy.n_bytes + BLOCK_BYTES - 1) / BLOCK_BYTES;
     unsigned int n_words = copy.is_aligned ? copy.n_bytes / 16 : 0;

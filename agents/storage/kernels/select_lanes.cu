@@ -1,7 +1,7 @@
 // Selects lanes of many tensors in one launch. A block copies neighbouring words of one tensor, a
 // thread several of them, whose loads do not wait for each other.
 #include "common/constants.h"
-#include "common/dependent_launch.h"
+#include "common/rows.h"
 #include "constants.h"
 #include "params.h"
 
@@ -30,12 +30,7 @@ __device__ void copy_words(const SelectLanesParams& p, const SelectParams& tenso
 
 KERNEL select_lanes(SelectLanesParams p) {
     wait_for_previous();
-    int chosen = 0, end = p.n_tensors;  // the last one that begins at or before this block
-    while (end - chosen > 1) {
-        int middle = (chosen + end) / 2;
-        (p.tensors[middle].first_block <= blockIdx.x ? chosen : end) = middle;
-    }
-    const SelectParams& tensor = p.tensors[chosen];
+    const SelectParams& tensor = p.tensors[row_of_block(p.tensors, p.n_tensors)];
     unsigned int first = (blockIdx.x - tensor.first_block) * (BLOCK * COPY_WORDS) + threadIdx.x;
     if (tensor.word_size == 16)
         copy_words<uint4>(p, tensor, first);
