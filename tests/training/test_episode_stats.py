@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.training import episode_stats
 from megastep.agents.training.episode_stats import N_INTERVALS, EpisodeStats, lane_groups
 
@@ -269,3 +270,39 @@ def test_an_episode_without_an_end_holds_up_no_report(monkeypatch):
         episodes.add(torch.ones(10, 2), none, done)
         counts.append(episodes.pop()["episode/count"])
     assert counts == [0, 0, 0, 3 + 2 + 2, 2, 2, 2, 2]
+
+
+@pytest.mark.cuda
+def test_a_graph_on_a_gpu_counts_as_the_cpu_does():
+    """Over several rollouts and reports, with a group, NaN rewards, infinite metrics, lanes that do
+    not learn, sources, and layouts out of range.
+    """
+    shape, group = (32, 300), torch.arange(300) % 3 == 0
+    sources, device = ["homes", "maze", "maze", "bench"], torch.device("cuda")
+    plain, graphed = (
+        EpisodeStats(300, at, ["laps"], {"some": group.to(at)}, True, sources)
+        for at in ("cpu", device)
+    )
+    kept = []
+
+    def add(rows):
+        graphed.add(*rows[:4], {"laps": rows[4]}, rows[5])
+        return {}
+
+    count = CudaGraphUpdate(add, device, graph=True)
+    for seed in range(8):
+        torch.manual_seed(seed)
+        reward, laps = torch.randn(2, *shape)
+        reward[torch.rand(shape) < 0.01] = torch.nan
+        laps[torch.rand(shape) < 0.01] = torch.inf
+        flags = [torch.rand(shape) < p for p in (0.1, 0.1, 0.9)]
+        rows = [reward, *flags, laps, torch.randint(-1, 6, shape, dtype=torch.int32)]
+        plain.add(*rows[:4], {"laps": laps}, rows[5])
+        kept[:] = kept or [row.to(device) for row in rows]
+        for there, here in zip(kept, rows, strict=True):
+            there.copy_(here)
+        count(kept)
+        torch.testing.assert_close(graphed.sums.cpu(), plain.sums)
+        assert graphed.pop() == pytest.approx(plain.pop())
+        assert graphed.intervals == plain.intervals
+    assert plain.windows[0] and graphed.began.cpu().equal(plain.began)
