@@ -97,7 +97,7 @@ class Run:
         are `split`, `seed`, `device`, `privileged`, and settings of the environment.
         """
         own = {key: self.config[key] for key in ("env", "geometry")}
-        if "n" in own["geometry"]:
+        if own["geometry"].get("n"):
             own["geometry"] = own["geometry"] | {"n": min(n_envs, own["geometry"]["n"])}
         if geometry is not None:
             own["geometry"] = geometry
