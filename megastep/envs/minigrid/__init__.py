@@ -1,0 +1,5 @@
+"""MiniGrid: the environment, with the kernel of its step."""
+
+from megastep.envs.minigrid.minigrid import MiniGrid
+
+__all__ = ["MiniGrid"]

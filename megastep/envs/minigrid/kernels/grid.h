@@ -1,0 +1,125 @@
+// The state of MiniGrid's games, and how random numbers are drawn.
+#pragma once
+#include "common/errors.h"
+#include "common/philox.h"
+#include "constants.h"
+
+// N games of W x H cells.
+struct MiniGridStepParams {
+    unsigned char* cells;       // (N, H, W) in and out
+    int* games;                 // (GAME_FIELDS, N) in and out: the fields of Game, in order
+    const long long* actions;   // (N)
+    float* reward;              // (N) out, as the next six
+    unsigned char* reset;       // (N)
+    unsigned char* terminal;    // (N)
+    unsigned char* truncated;   // (N)
+    float* metrics;             // (N) 1 where an episode ends with success
+    unsigned char* image;       // (N, 3, VIEW, VIEW)
+    long long* direction;       // (N) 0 right, 1 down, 2 left, 3 up
+    unsigned short* mission;    // (N, N_MISSION) fp16, or null
+    const unsigned char* layouts;  // (D, H, W) for CUSTOM, or null
+    const int* starts;             // (D, 3): x, y and direction of the agent
+    int* error_flag;            // (1) out: see common/errors.h
+    unsigned int key0;          // the seed
+    unsigned int key1;
+    int n_envs;        // N
+    int width;         // W
+    int height;        // H
+    int limit;         // steps of an episode
+    int task;          // see constants.h
+    int a;             // of the task: see layouts.h; D
+    int b;             // of the task
+    int n_actions;     // those above are errors
+    int sees_through;  // whether the agent sees through walls
+    int n_threads;     // CPU threads
+};
+
+constexpr int TURN_LEFT = 0, TURN_RIGHT = 1, FORWARD = 2, PICK_UP = 3, DROP = 4, TOGGLE = 5, DONE = 6;
+constexpr int RED = 0, GREEN = 1, BLUE = 2, PURPLE = 3, YELLOW = 4, GREY = 5, N_COLOURS = 6;
+constexpr int BALL_BLUE = BALL + 16 * BLUE;
+constexpr int NO_LIMIT = 1 << 30;  // of tries
+
+struct Game {
+    int x, y, direction;
+    int carried;  // a cell; 0: nothing
+    int age;      // steps of the episode
+    int n_draws;  // numbers drawn so far, the generator's counter
+    int ended;
+    int marks[2];    // what the task's success depends on: cells or their contents
+    int mission[2];  // contents that the mission names; 0: none
+    int obstacles[MAX_OBSTACLES];  // their cells
+};
+
+struct Grid {
+    const MiniGridStepParams& p;
+    unsigned char* cells;
+    int width, height, env;
+};
+
+// Cells x to x + width - 1 and y to y + height - 1.
+struct Rectangle {
+    int x, y, width, height;
+};
+
+HD void load_game(Game& g, const int* games, long long n_envs, int env) {
+    int* fields = (int*)&g;
+    for (int i = 0; i < GAME_FIELDS; i++)
+        fields[i] = games[i * n_envs + env];
+}
+
+HD void store_game(const Game& g, int* games, long long n_envs, int env) {
+    const int* fields = (const int*)&g;
+    for (int i = 0; i < GAME_FIELDS; i++)
+        games[i * n_envs + env] = fields[i];
+}
+
+HD int absi(int x) { return x < 0 ? -x : x; }
+HD int cell_of(int kind, int colour) { return kind + 16 * colour; }
+HD int kind_of(int cell) { return cell & 15; }
+HD int colour_of(int cell) { return cell >> 4; }
+HD int at(const Grid& grid, int x, int y) { return y * grid.width + x; }
+HD int dx_of(int direction) { return direction == 0 ? 1 : direction == 2 ? -1 : 0; }
+HD int dy_of(int direction) { return direction == 1 ? 1 : direction == 3 ? -1 : 0; }
+
+// The cell itself, or the first one if it is not in the grid, whatever was written into a game.
+HD int inside(const Grid& grid, int cell) {
+    return (unsigned int)cell < (unsigned int)(grid.width * grid.height) ? cell : 0;
+}
+
+// Agents stand inside of walls, so the cell in front of one is in the grid.
+HD int front_of(const Game& g, const Grid& grid) {
+    return inside(grid, at(grid, g.x + dx_of(g.direction), g.y + dy_of(g.direction)));
+}
+
+HD int is_beside(const Grid& grid, int a, int b) {
+    return absi(a % grid.width - b % grid.width) + absi(a / grid.width - b / grid.width) == 1;
+}
+
+// A random integer in [low, high).
+HD int draw(Game& g, const Grid& grid, int low, int high) {
+    Philox bits =
+        philox((unsigned int)grid.env, (unsigned int)g.n_draws++, grid.p.key0, grid.p.key1);
+    return low + (int)((unsigned long long)bits.a * (unsigned int)(high - low) >> 32);
+}
+
+// Draws places in a rectangle until one holds nothing, is not the agent's, and is not rejected.
+// Puts a cell's contents there. Returns the place, or -1 after so many tries.
+template <class IsRejected>
+HD int place_unless(Game& g, const Grid& grid, int cell, Rectangle in, int n_tries,
+                    IsRejected is_rejected) {
+    int left = maxi(in.x, 0), top = maxi(in.y, 0);
+    int right = mini(left + in.width, grid.width), bottom = mini(top + in.height, grid.height);
+    for (int i = 0; i < n_tries; i++) {
+        int x = draw(g, grid, left, right), y = draw(g, grid, top, bottom);
+        int place = at(grid, x, y);
+        if (grid.cells[place] != EMPTY || (x == g.x && y == g.y) || is_rejected(x, y))
+            continue;
+        grid.cells[place] = (unsigned char)cell;
+        return place;
+    }
+    return -1;
+}
+
+HD int place(Game& g, const Grid& grid, int cell, Rectangle in, int n_tries = NO_LIMIT) {
+    return place_unless(g, grid, cell, in, n_tries, [](int, int) { return 0; });
+}
