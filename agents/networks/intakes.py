@@ -73,12 +73,30 @@ class OneHot(Encoder):
         return obs[..., None].eq(self.values).flatten(-2)
 
 
+class Categories(Encoder):
+    """One-hot encoding of the pixels of images whose values are categories below `N`, such as
+    MiniGrid's: (..., A, C, H, W) -> (..., A C H W N).
+    """
+
+    N = 11
+    values: torch.Tensor  # (N,)
+
+    def __init__(self, space: Space):
+        super().__init__()
+        self.n_features = math.prod(space.shape) * self.N
+        self.register_buffer("values", torch.arange(self.N, dtype=torch.uint8), persistent=False)
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return obs[..., None].eq(self.values).flatten(-5)
+
+
 #: Encoders of images by name. An encoder is a module `Encoder(space)` with `n_features` that maps
 #: images (..., A, C, H, W) to features (..., n_features).
 ENCODERS = {
     "linear": "megastep.agents.networks.intakes:Flat",
     "conv": "megastep.agents.networks.convolutions:Conv",
     "cnn": "megastep.agents.networks.convolutions:Cnn",
+    "categories": "megastep.agents.networks.intakes:Categories",
 }
 
 
