@@ -3,11 +3,13 @@ end.
 """
 
 import functools
+import warnings
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from torch.utils._pytree import tree_leaves as leaves
 
 from megastep import envs
 from megastep.arrdict import arrdict
@@ -41,7 +43,9 @@ class OurDraws:
 
 @functools.cache
 def original(id):
-    return gymnasium.make(id, disable_env_checker=True).unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a newer version of a task is there
+        return gymnasium.make(id, disable_env_checker=True).unwrapped
 
 
 def mission_of(text):
@@ -105,3 +109,81 @@ def play(id, n_envs, n_episodes, seed=3):
 @pytest.mark.parametrize("id", TASKS)
 def test_equals_the_original(id):
     play(id, n_envs=2, n_episodes=1)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("id", TASKS)
+def test_equals_the_original_for_a_thousand_episodes(id):
+    play(id, n_envs=50, n_episodes=20, seed=7)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("id", TASKS)
+def test_gpu_has_the_bits_of_the_cpu(id):
+    worlds = []
+    actions = torch.randint(3, (200, 300, 1), generator=torch.Generator().manual_seed(1))
+    for device in "cpu", "cuda":
+        env = envs.MiniGrid(300, id=id, device=device)
+        env.reset()
+        worlds.append([env.step(arrdict(actions=a.to(device))).clone() for a in actions])
+        worlds[-1].append(arrdict(cells=env.cells, games=env.games))
+    for ours, theirs in zip(*worlds, strict=True):
+        assert all((a == b.cpu()).all() for a, b in zip(leaves(ours), leaves(theirs), strict=True))
+
+
+def empty_rooms(seed):
+    """Two rooms of 5 x 4 cells, with a goal in different corners."""
+    cells = torch.full((2, 4, 5), 2 + 16 * 5)
+    cells[:, 1:3, 1:4] = 1
+    cells[0, 2, 3] = cells[1, 1, 3] = 8 + 16
+    return cells, torch.tensor([(1, 1, 0), (1, 1, 0)])
+
+
+def broken_rooms(seed):
+    cells, starts = empty_rooms(seed)
+    cells[1, 1, 1] = 12
+    return cells, starts
+
+
+def test_grids_of_a_users_function(device):
+    env = envs.MiniGrid(64, layouts=f"{__name__}:empty_rooms", limit=20, device=device)
+    env.reset()
+    goals = (env.cells == 8 + 16).flatten(1).int().argmax(1)
+    assert set(goals.tolist()) == {8, 13}
+    forward = arrdict(actions=torch.full((64, 1), 2, device=device))
+    env.step(forward)
+    world = env.step(forward)
+    is_ahead = goals == 8
+    assert torch.equal(world.terminal, is_ahead) and torch.equal(
+        world.metrics.success == 1, is_ahead
+    )
+    assert world.reward[is_ahead].tolist() == [np.float32(1 - 0.9 * 2 / 20)] * int(is_ahead.sum())
+
+
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        (dict(id="MiniGrid-DoorKey-9x9-v0"), "near are MiniGrid-DoorKey-"),
+        (dict(layouts=f"{__name__}:broken_rooms"), "grid 1 has a cell that is no kind"),
+    ],
+)
+def test_bad_settings(settings, words):
+    with pytest.raises(ValueError, match=words):
+        envs.MiniGrid(2, device="cpu", **settings)
+
+
+@pytest.mark.parametrize("value", [-(2**31), -1, 2**31 - 1])
+def test_what_is_written_into_games_ends_no_process(value, device):
+    for id in "MiniGrid-RedBlueDoors-6x6-v0", "MiniGrid-Dynamic-Obstacles-6x6-v0":
+        env = envs.MiniGrid(2, id=id, device=device)
+        env.reset()
+        for row in range(len(env.games)):
+            env.games[row] = value
+            env.step(arrdict(actions=torch.full((2, 1), 2, device=device)))
+
+
+def test_picture(tmp_path):
+    env = envs.MiniGrid(1, id="MiniGrid-KeyCorridorS3R3-v0", device="cpu")
+    env.reset()
+    env.display().savefig(tmp_path / "grid.png")
+    assert (tmp_path / "grid.png").stat().st_size > 2000

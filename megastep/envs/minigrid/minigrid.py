@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from pydantic import Field
@@ -15,7 +15,7 @@ from megastep.engine.launch_params import seed_params
 from megastep.envs.common import DisplayedEnv, step_outputs, world_of
 from megastep.envs.minigrid.drawing import draw
 from megastep.envs.minigrid.tasks import LIBRARY, TASKS, Task
-from megastep.imports import resolve
+from megastep.imports import import_object
 from megastep.kernels.build.launch import launch
 from megastep.settings import MAX_ENVS, checked
 
@@ -57,7 +57,7 @@ class MiniGrid(DisplayedEnv):
     Args:
         n_envs: number of environments.
         id: task, by its id in Gymnasium's registry.
-        layouts: draws grids in place of a task's, or its import path: see :meth:`custom`.
+        layouts: import path of a function that draws grids in place of a task's; see docs/grids.md.
         limit: steps of an episode in such grids.
         seed: of the layouts and of what moves.
         device: default: a GPU if there is one.
@@ -73,7 +73,7 @@ class MiniGrid(DisplayedEnv):
         n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
         *,
         id: str = "MiniGrid-DoorKey-8x8-v0",
-        layouts: str | Callable[[int], tuple[torch.Tensor, torch.Tensor]] | None = None,
+        layouts: str | None = None,
         limit: Annotated[int, Field(ge=1, le=10**6)] = 1000,
         seed: int = 1,
         device: torch.device | str | None = None,
@@ -84,8 +84,7 @@ class MiniGrid(DisplayedEnv):
         if layouts is None:
             self.task = task_of(id)
         else:
-            function: Any = resolve(layouts, {}) if isinstance(layouts, str) else layouts
-            cells, starts = custom(function, seed)
+            cells, starts = custom(import_object(layouts), seed)
             self.layouts, self.starts = cells.to(self.device), starts.to(self.device)
             n, height, width = cells.shape
             self.task = Task(LIBRARY.constants["CUSTOM"], width, height, limit, a=n)
