@@ -3,6 +3,7 @@ end.
 """
 
 import functools
+import re
 import warnings
 
 import gymnasium
@@ -12,8 +13,10 @@ import torch
 from torch.utils._pytree import tree_leaves as leaves
 
 from megastep import envs
+from megastep.agents.cli import train
 from megastep.arrdict import arrdict
 from megastep.envs.minigrid.tasks import TASKS
+from tests.helpers.pages import ROOT
 from tests.helpers.pong_twins import philox
 
 minigrid = pytest.importorskip("minigrid", minversion="3.2", reason="needs minigrid of Python 3.11")
@@ -187,3 +190,12 @@ def test_picture(tmp_path):
     env.reset()
     env.display().savefig(tmp_path / "grid.png")
     assert (tmp_path / "grid.png").stat().st_size > 2000
+
+
+def test_the_pages_example(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "grids.md").read_text(), re.S)
+    (tmp_path / "my_rooms.py").write_text(code)
+    words = ["experiment=minigrid", "env.layouts=my_rooms:corners", "env.limit=100", "device=cpu"]
+    words += ["env.n_envs=16", "agent.width=8", "samples=2000", "folder=run"]
+    assert train.main(words) == 0 and (tmp_path / "run" / "metrics.jsonl").exists()

@@ -38,23 +38,23 @@ def _tasks() -> dict[str, Task]:
         tasks[f"MiniGrid-{name}"] = Task(_C[task], size, height or size, limit, **more)
 
     for size in 5, 6, 8, 16:
-        empty = dict(task="EMPTY_ROOM", size=size, limit=4 * size**2, sees_through=1)
+        empty: dict = dict(task="EMPTY_ROOM", size=size, limit=4 * size**2, sees_through=1)
         add(f"Empty-{size}x{size}-v0", **empty)
-        obstacles = dict(empty, task="DYNAMIC_OBSTACLES", b=min(size // 2, 8), n_actions=3)
+        obstacles: dict = dict(empty, task="DYNAMIC_OBSTACLES", b=min(size // 2, 8), n_actions=3)
         add(f"Dynamic-Obstacles-{size}x{size}-v0", **obstacles)
         if size < 8:
             add(f"Empty-Random-{size}x{size}-v0", **empty, a=1)
             add(f"Dynamic-Obstacles-Random-{size}x{size}-v0", **obstacles, a=1)
         add(f"DoorKey-{size}x{size}-v0", "DOOR_KEY", size, 10 * size**2)
         if size < 16:
-            door = dict(sees_through=1)
+            door: dict = dict(sees_through=1)
             add(f"GoToDoor-{size}x{size}-v0", "GO_TO_DOOR", size, 4 * size**2, **door)
     add("FourRooms-v0", "FOUR_ROOMS", 19, 100)
     add("Unlock-v0", "UNLOCK", 11, 288, 6)
     add("UnlockPickup-v0", "UNLOCK_PICKUP", 11, 288, 6)
     for size, n_rows in (3, 1), (3, 2), (3, 3), (4, 3), (5, 3), (6, 3):
         width, height = 3 * (size - 1) + 1, n_rows * (size - 1) + 1
-        corridor = dict(a=size, b=n_rows)
+        corridor: dict = dict(a=size, b=n_rows)
         name = f"KeyCorridorS{size}R{n_rows}-v0"
         add(name, "KEY_CORRIDOR", width, 30 * size**2, height, **corridor)
     for name, n_rooms, size in (
@@ -78,7 +78,7 @@ def _tasks() -> dict[str, Task]:
             add(f"MemoryS{size}Random-v0", "MEMORY", size, 5 * size**2, a=1)
     for size in 6, 8:
         add(f"RedBlueDoors-{size}x{size}-v0", "RED_BLUE_DOORS", 2 * size, 20 * size**2, size)
-        near = dict(b=2 if size == 6 else 3, sees_through=1)
+        near: dict = dict(b=2 if size == 6 else 3, sees_through=1)
         add(f"PutNear-{size}x{size}-N{near['b']}-v0", "PUT_NEAR", size, 5 * size, **near)
     return tasks
 

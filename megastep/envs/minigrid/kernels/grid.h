@@ -6,21 +6,21 @@
 
 // N games of W x H cells.
 struct MiniGridStepParams {
-    unsigned char* cells;       // (N, H, W) in and out
-    int* games;                 // (GAME_FIELDS, N) in and out: the fields of Game, in order
-    const long long* actions;   // (N)
-    float* reward;              // (N) out, as the next six
-    unsigned char* reset;       // (N)
-    unsigned char* terminal;    // (N)
-    unsigned char* truncated;   // (N)
-    float* metrics;             // (N) 1 where an episode ends with success
-    unsigned char* image;       // (N, 3, VIEW, VIEW)
-    long long* direction;       // (N) 0 right, 1 down, 2 left, 3 up
-    unsigned short* mission;    // (N, N_MISSION) fp16, or null
+    unsigned char* cells;          // (N, H, W) in and out
+    int* games;                    // (GAME_FIELDS, N) in and out: the fields of Game, in order
+    const long long* actions;      // (N)
+    float* reward;                 // (N) out, as the next six
+    unsigned char* reset;          // (N)
+    unsigned char* terminal;       // (N)
+    unsigned char* truncated;      // (N)
+    float* metrics;                // (N) 1 where an episode ends with success
+    unsigned char* image;          // (N, 3, VIEW, VIEW)
+    long long* direction;          // (N) 0 right, 1 down, 2 left, 3 up
+    unsigned short* mission;       // (N, N_MISSION) fp16, or null
     const unsigned char* layouts;  // (D, H, W) for CUSTOM, or null
     const int* starts;             // (D, 3): x, y and direction of the agent
-    int* error_flag;            // (1) out: see common/errors.h
-    unsigned int key0;          // the seed
+    int* error_flag;               // (1) out: see common/errors.h
+    unsigned int key0;             // the seed
     unsigned int key1;
     int n_envs;        // N
     int width;         // W
@@ -34,7 +34,8 @@ struct MiniGridStepParams {
     int n_threads;     // CPU threads
 };
 
-constexpr int TURN_LEFT = 0, TURN_RIGHT = 1, FORWARD = 2, PICK_UP = 3, DROP = 4, TOGGLE = 5, DONE = 6;
+constexpr int TURN_LEFT = 0, TURN_RIGHT = 1, FORWARD = 2, PICK_UP = 3, DROP = 4, TOGGLE = 5,
+              DONE = 6;
 constexpr int RED = 0, GREEN = 1, BLUE = 2, PURPLE = 3, YELLOW = 4, GREY = 5, N_COLOURS = 6;
 constexpr int BALL_BLUE = BALL + 16 * BLUE;
 constexpr int NO_LIMIT = 1 << 30;  // of tries
@@ -45,8 +46,8 @@ struct Game {
     int age;      // steps of the episode
     int n_draws;  // numbers drawn so far, the generator's counter
     int ended;
-    int marks[2];    // what the task's success depends on: cells or their contents
-    int mission[2];  // contents that the mission names; 0: none
+    int marks[2];                  // what the task's success depends on: cells or their contents
+    int mission[2];                // contents that the mission names; 0: none
     int obstacles[MAX_OBSTACLES];  // their cells
 };
 

@@ -124,7 +124,8 @@ HD Rooms make_rooms(Game& g, const Grid& grid, int size, int n_columns, int n_ro
             wall_around(grid, room(r, i, j));
     for (int j = 0; j < n_rows; j++)
         for (int i = 0; i < n_columns; i++) {
-            int x = i * (size - 1), y = j * (size - 1), *places = r.places + 2 * (j * n_columns + i);
+            int x = i * (size - 1), y = j * (size - 1),
+                *places = r.places + 2 * (j * n_columns + i);
             if (i < n_columns - 1)
                 places[0] = at(grid, x + size - 1, draw(g, grid, y + 1, y + size - 1));
             if (j < n_rows - 1)
@@ -369,7 +370,8 @@ HD void dynamic_obstacles(Game& g, const Grid& grid) {
 
 // a: whether the hallway's length is random.
 HD void memory(Game& g, const Grid& grid) {
-    int middle = grid.height / 2, end = grid.p.a ? draw(g, grid, 4, grid.width - 2) : grid.width - 3;
+    int middle = grid.height / 2,
+        end = grid.p.a ? draw(g, grid, 4, grid.width - 2) : grid.width - 3;
     wall(grid, {1, middle - 2, 4, 1});
     wall(grid, {1, middle + 2, 4, 1});
     wall(grid, {4, middle - 1, 1, 1});
@@ -416,8 +418,8 @@ HD void put_near(Game& g, const Grid& grid) {
         places[n] = place_unless(g, grid, object, all_of(grid), NO_LIMIT, [&](int x, int y) {
             int is_near = 0;
             for (int i = 0; i < n; i++)
-                is_near |= absi(x - places[i] % grid.width) <= 1 &&
-                           absi(y - places[i] / grid.width) <= 1;
+                is_near |=
+                    absi(x - places[i] % grid.width) <= 1 && absi(y - places[i] / grid.width) <= 1;
             return is_near;
         });
         objects[n++] = object;
@@ -473,21 +475,37 @@ HD void new_game(Game& g, const Grid& grid) {
     g.carried = g.age = g.ended = 0;
     g.marks[0] = g.marks[1] = g.mission[0] = g.mission[1] = 0;
     switch (task) {
-    case EMPTY_ROOM: return empty_room(g, grid);
-    case FOUR_ROOMS: return four_rooms(g, grid);
-    case DOOR_KEY: return door_key(g, grid);
-    case UNLOCK: return unlock(g, grid, 0);
-    case UNLOCK_PICKUP: return unlock(g, grid, 1);
-    case KEY_CORRIDOR: return key_corridor(g, grid);
-    case MULTI_ROOM: return multi_room(g, grid);
-    case LAVA_GAP: return lava_gap(g, grid);
-    case CROSSING: return crossing(g, grid);
-    case DIST_SHIFT: return dist_shift(g, grid);
-    case MEMORY: return memory(g, grid);
-    case RED_BLUE_DOORS: return red_blue_doors(g, grid);
-    case DYNAMIC_OBSTACLES: return dynamic_obstacles(g, grid);
-    case PUT_NEAR: return put_near(g, grid);
-    case GO_TO_DOOR: return go_to_door(g, grid);
-    case CUSTOM: return custom(g, grid);
+        case EMPTY_ROOM:
+            return empty_room(g, grid);
+        case FOUR_ROOMS:
+            return four_rooms(g, grid);
+        case DOOR_KEY:
+            return door_key(g, grid);
+        case UNLOCK:
+            return unlock(g, grid, 0);
+        case UNLOCK_PICKUP:
+            return unlock(g, grid, 1);
+        case KEY_CORRIDOR:
+            return key_corridor(g, grid);
+        case MULTI_ROOM:
+            return multi_room(g, grid);
+        case LAVA_GAP:
+            return lava_gap(g, grid);
+        case CROSSING:
+            return crossing(g, grid);
+        case DIST_SHIFT:
+            return dist_shift(g, grid);
+        case MEMORY:
+            return memory(g, grid);
+        case RED_BLUE_DOORS:
+            return red_blue_doors(g, grid);
+        case DYNAMIC_OBSTACLES:
+            return dynamic_obstacles(g, grid);
+        case PUT_NEAR:
+            return put_near(g, grid);
+        case GO_TO_DOOR:
+            return go_to_door(g, grid);
+        case CUSTOM:
+            return custom(g, grid);
     }
 }

@@ -10,16 +10,16 @@ HD void turn(Game& g, int by) { g.direction = (g.direction + by) & 3; }
 HD int toggled(int cell, int carried) {
     int colour = colour_of(cell);
     switch (kind_of(cell)) {
-    case BOX:
-        return EMPTY;
-    case OPEN_DOOR:
-        return cell_of(CLOSED_DOOR, colour);
-    case CLOSED_DOOR:
-        return cell_of(OPEN_DOOR, colour);
-    case LOCKED_DOOR:
-        return carried == cell_of(KEY, colour) ? cell_of(OPEN_DOOR, colour) : cell;
-    default:
-        return cell;
+        case BOX:
+            return EMPTY;
+        case OPEN_DOOR:
+            return cell_of(CLOSED_DOOR, colour);
+        case CLOSED_DOOR:
+            return cell_of(OPEN_DOOR, colour);
+        case LOCKED_DOOR:
+            return carried == cell_of(KEY, colour) ? cell_of(OPEN_DOOR, colour) : cell;
+        default:
+            return cell;
     }
 }
 
@@ -51,39 +51,41 @@ HD Outcome act(Game& g, const Grid& grid, int action) {
     Outcome outcome = {0, 0, 0};
     int front = front_of(g, grid), cell = grid.cells[front];
     switch (action) {
-    case TURN_LEFT:
-        turn(g, 3);
-        break;
-    case TURN_RIGHT:
-        turn(g, 1);
-        break;
-    case FORWARD:
-        if (can_be_entered(cell)) {
-            g.x = front % grid.width;
-            g.y = front / grid.width;
-        }
-        outcome.is_success = kind_of(cell) == GOAL;
-        outcome.is_terminal = outcome.is_success || kind_of(cell) == LAVA;
-        break;
-    case PICK_UP:
-        if (can_be_picked_up(cell) && !g.carried) {
-            g.carried = cell;
-            grid.cells[front] = EMPTY;
-        }
-        break;
-    case DROP:
-        if (cell == EMPTY && g.carried) {
-            grid.cells[front] = (unsigned char)g.carried;
-            g.carried = 0;
-        }
-        break;
-    case TOGGLE:
-        grid.cells[front] = (unsigned char)toggled(cell, g.carried);
+        case TURN_LEFT:
+            turn(g, 3);
+            break;
+        case TURN_RIGHT:
+            turn(g, 1);
+            break;
+        case FORWARD:
+            if (can_be_entered(cell)) {
+                g.x = front % grid.width;
+                g.y = front / grid.width;
+            }
+            outcome.is_success = kind_of(cell) == GOAL;
+            outcome.is_terminal = outcome.is_success || kind_of(cell) == LAVA;
+            break;
+        case PICK_UP:
+            if (can_be_picked_up(cell) && !g.carried) {
+                g.carried = cell;
+                grid.cells[front] = EMPTY;
+            }
+            break;
+        case DROP:
+            if (cell == EMPTY && g.carried) {
+                grid.cells[front] = (unsigned char)g.carried;
+                g.carried = 0;
+            }
+            break;
+        case TOGGLE:
+            grid.cells[front] = (unsigned char)toggled(cell, g.carried);
     }
     return outcome;
 }
 
-HD int is_open(const Grid& grid, int at) { return kind_of(grid.cells[inside(grid, at)]) == OPEN_DOOR; }
+HD int is_open(const Grid& grid, int at) {
+    return kind_of(grid.cells[inside(grid, at)]) == OPEN_DOOR;
+}
 
 HD int distance(const Grid& grid, int a, int b) {
     return maxi(absi(a % grid.width - b % grid.width), absi(a / grid.width - b / grid.width));
@@ -134,9 +136,9 @@ HD Outcome play(Game& g, const Grid& grid, int action) {
 
 // ---- Observations ----
 
-// The cells that the agent sees, one bit each: row j of the view in bits VIEW j to VIEW j + 6. A row
-// of cells that one can look through passes what is seen along it and to the row before it: first
-// to the right and then to the left, as the original does.
+// The cells that the agent sees, one bit each: row j of the view in bits VIEW j to VIEW j + 6. A
+// row of cells that one can look through passes what is seen along it and to the row before it:
+// first to the right and then to the left, as the original does.
 HD unsigned long long visible_cells(unsigned long long clear) {
     const unsigned int row_mask = (1u << VIEW) - 1u;
     unsigned long long seen = 0;
