@@ -2,6 +2,7 @@
 #pragma once
 
 #define HD static inline
+#define RARE static inline
 #define KERNEL extern "C" void
 #define EACH(operation, Params, count, threads, statement)                                         \
     KERNEL operation(const Params& p) {                                                            \

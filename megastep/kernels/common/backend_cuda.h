@@ -4,6 +4,7 @@
 #include "common/dependent_launch.h"
 
 #define HD static __device__ __forceinline__
+#define RARE static __device__ __noinline__
 #define EACH(operation, Params, count, threads, statement)        \
     KERNEL operation(Params p) {                                  \
         wait_for_previous();                                      \

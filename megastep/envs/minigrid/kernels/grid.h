@@ -96,11 +96,15 @@ HD int is_beside(const Grid& grid, int a, int b) {
     return absi(a % grid.width - b % grid.width) + absi(a / grid.width - b / grid.width) == 1;
 }
 
+// A word of 32 random bits.
+RARE unsigned int word_of(int env, int draw, unsigned int key0, unsigned int key1) {
+    return philox((unsigned int)env, (unsigned int)draw, key0, key1).a;
+}
+
 // A random integer in [low, high).
 HD int draw(Game& g, const Grid& grid, int low, int high) {
-    Philox bits =
-        philox((unsigned int)grid.env, (unsigned int)g.n_draws++, grid.p.key0, grid.p.key1);
-    return low + (int)((unsigned long long)bits.a * (unsigned int)(high - low) >> 32);
+    unsigned int word = word_of(grid.env, g.n_draws++, grid.p.key0, grid.p.key1);
+    return low + (int)((unsigned long long)word * (unsigned int)(high - low) >> 32);
 }
 
 // Draws places in a rectangle until one holds nothing, is not the agent's, and is not rejected.
@@ -121,6 +125,6 @@ HD int place_unless(Game& g, const Grid& grid, int cell, Rectangle in, int n_tri
     return -1;
 }
 
-HD int place(Game& g, const Grid& grid, int cell, Rectangle in, int n_tries = NO_LIMIT) {
+RARE int place(Game& g, const Grid& grid, int cell, Rectangle in, int n_tries = NO_LIMIT) {
     return place_unless(g, grid, cell, in, n_tries, [](int, int) { return 0; });
 }

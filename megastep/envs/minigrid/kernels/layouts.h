@@ -12,7 +12,7 @@ HD int draw_colour(Game& g, const Grid& grid) {
     return colour_by_name(draw(g, grid, 0, N_COLOURS));
 }
 
-HD void fill(const Grid& grid, Rectangle in, int cell) {
+RARE void fill(const Grid& grid, Rectangle in, int cell) {
     for (int y = in.y; y < in.y + in.height; y++)
         for (int x = in.x; x < in.x + in.width; x++)
             grid.cells[at(grid, x, y)] = (unsigned char)cell;
@@ -41,21 +41,21 @@ HD void stand(Game& g, int x, int y, int direction) {
     g.direction = direction;
 }
 
-HD void place_agent(Game& g, const Grid& grid, Rectangle in) {
+RARE void place_agent(Game& g, const Grid& grid, Rectangle in) {
     stand(g, -1, -1, g.direction);
     int place_of = place(g, grid, EMPTY, in);
     stand(g, place_of % grid.width, place_of / grid.width, draw(g, grid, 0, 4));
 }
 
 // a: whether the agent starts anywhere.
-HD void empty_room(Game& g, const Grid& grid) {
+RARE void empty_room(Game& g, const Grid& grid) {
     put_goal(grid, grid.width - 2, grid.height - 2);
     stand(g, 1, 1, 0);
     if (grid.p.a)
         place_agent(g, grid, all_of(grid));
 }
 
-HD void four_rooms(Game& g, const Grid& grid) {
+RARE void four_rooms(Game& g, const Grid& grid) {
     int w = grid.width / 2, h = grid.height / 2;
     for (int j = 0; j < 2; j++)
         for (int i = 0; i < 2; i++) {
@@ -73,7 +73,7 @@ HD void four_rooms(Game& g, const Grid& grid) {
     place(g, grid, cell_of(GOAL, GREEN), all_of(grid));
 }
 
-HD void door_key(Game& g, const Grid& grid) {
+RARE void door_key(Game& g, const Grid& grid) {
     put_goal(grid, grid.width - 2, grid.height - 2);
     int split = draw(g, grid, 2, grid.width - 2);
     Rectangle left = {0, 0, split, grid.height};
@@ -166,7 +166,7 @@ HD void place_in_room(Game& g, const Grid& grid, const Rooms& r, int i, int j) {
     } while (front != EMPTY && front != WALL);
 }
 
-HD void unlock(Game& g, const Grid& grid, int with_box) {
+RARE void unlock(Game& g, const Grid& grid, int with_box) {
     Rooms r = make_rooms(g, grid, 6, 2, 1);
     int box = with_box ? add_random(g, grid, r, 1, 0, BOX) : 0;
     int colour = add_door(g, grid, r, 0, 0, TO_RIGHT, LOCKED_DOOR);
@@ -190,7 +190,7 @@ HD int are_connected(const Rooms& r, int start) {
 }
 
 // a: size of the rooms, b: rows.
-HD void key_corridor(Game& g, const Grid& grid) {
+RARE void key_corridor(Game& g, const Grid& grid) {
     int n_rows = grid.p.b;
     Rooms r = make_rooms(g, grid, grid.p.a, 3, n_rows);
     for (int j = 1; j < n_rows; j++) {
@@ -273,7 +273,7 @@ HD int chain_rooms(Game& g, const Grid& grid, ChainedRoom* rooms, int n_rooms) {
 }
 
 // a: rooms, b: the largest size of a room.
-HD void multi_room(Game& g, const Grid& grid) {
+RARE void multi_room(Game& g, const Grid& grid) {
     ChainedRoom rooms[MAX_ROOMS];
     int n_rooms = draw(g, grid, grid.p.a, grid.p.a + 1), colour = -1;
     while (chain_rooms(g, grid, rooms, n_rooms) < n_rooms)
@@ -292,7 +292,7 @@ HD void multi_room(Game& g, const Grid& grid) {
 
 // ---- Obstacles ----
 
-HD void lava_gap(Game& g, const Grid& grid) {
+RARE void lava_gap(Game& g, const Grid& grid) {
     stand(g, 1, 1, 0);
     put_goal(grid, grid.width - 2, grid.height - 2);
     int x = draw(g, grid, 2, grid.width - 2), y = draw(g, grid, 1, grid.height - 1);
@@ -312,7 +312,7 @@ HD void shuffle(Game& g, const Grid& grid, int* items, int n) {
 constexpr int MAX_RIVERS = 16;
 
 // a: rivers, b: what they are of.
-HD void crossing(Game& g, const Grid& grid) {
+RARE void crossing(Game& g, const Grid& grid) {
     stand(g, 1, 1, 0);
     put_goal(grid, grid.width - 2, grid.height - 2);
     int size = grid.width, per_way = (size - 3) / 2, n = grid.p.a;
@@ -352,7 +352,7 @@ HD void crossing(Game& g, const Grid& grid) {
 }
 
 // a: the row of the second strip.
-HD void dist_shift(Game& g, const Grid& grid) {
+RARE void dist_shift(Game& g, const Grid& grid) {
     put_goal(grid, grid.width - 2, 1);
     fill(grid, {3, 1, grid.width - 6, 1}, cell_of(LAVA, RED));
     fill(grid, {3, grid.p.a, grid.width - 6, 1}, cell_of(LAVA, RED));
@@ -360,7 +360,7 @@ HD void dist_shift(Game& g, const Grid& grid) {
 }
 
 // a: whether the agent starts anywhere, b: obstacles.
-HD void dynamic_obstacles(Game& g, const Grid& grid) {
+RARE void dynamic_obstacles(Game& g, const Grid& grid) {
     empty_room(g, grid);
     for (int i = 0; i < grid.p.b; i++)
         g.obstacles[i] = place(g, grid, BALL_BLUE, all_of(grid));
@@ -369,7 +369,7 @@ HD void dynamic_obstacles(Game& g, const Grid& grid) {
 // ---- Missions ----
 
 // a: whether the hallway's length is random.
-HD void memory(Game& g, const Grid& grid) {
+RARE void memory(Game& g, const Grid& grid) {
     int middle = grid.height / 2,
         end = grid.p.a ? draw(g, grid, 4, grid.width - 2) : grid.width - 3;
     wall(grid, {1, middle - 2, 4, 1});
@@ -393,7 +393,7 @@ HD void memory(Game& g, const Grid& grid) {
     g.marks[is_up] = at(grid, end + 1, middle + 1);
 }
 
-HD void red_blue_doors(Game& g, const Grid& grid) {
+RARE void red_blue_doors(Game& g, const Grid& grid) {
     int size = grid.height;
     wall_around(grid, {size / 2, 0, size, size});
     place_agent(g, grid, {size / 2, 0, size, size});
@@ -406,7 +406,7 @@ HD void red_blue_doors(Game& g, const Grid& grid) {
 constexpr int MAX_OBJECTS = 3;
 
 // b: objects.
-HD void put_near(Game& g, const Grid& grid) {
+RARE void put_near(Game& g, const Grid& grid) {
     int objects[MAX_OBJECTS], places[MAX_OBJECTS], n = 0;
     while (n < grid.p.b) {
         int kind = KEY + draw(g, grid, 0, 3), object = cell_of(kind, draw_colour(g, grid));
@@ -434,7 +434,7 @@ HD void put_near(Game& g, const Grid& grid) {
     g.mission[1] = objects[target];
 }
 
-HD void go_to_door(Game& g, const Grid& grid) {
+RARE void go_to_door(Game& g, const Grid& grid) {
     int width = draw(g, grid, 5, grid.width + 1), height = draw(g, grid, 5, grid.height + 1);
     fill(grid, all_of(grid), EMPTY);
     wall_around(grid, {0, 0, width, height});
@@ -459,14 +459,14 @@ HD void go_to_door(Game& g, const Grid& grid) {
 }
 
 // A random one of those given. a: how many.
-HD void custom(Game& g, const Grid& grid) {
+RARE void custom(Game& g, const Grid& grid) {
     int i = draw(g, grid, 0, grid.p.a), n_cells = grid.width * grid.height;
     for (int k = 0; k < n_cells; k++)
         grid.cells[k] = grid.p.layouts[(long long)i * n_cells + k];
     stand(g, grid.p.starts[3 * i], grid.p.starts[3 * i + 1], grid.p.starts[3 * i + 2]);
 }
 
-HD void new_game(Game& g, const Grid& grid) {
+RARE void new_game(Game& g, const Grid& grid) {
     fill(grid, all_of(grid), EMPTY);
     int task = grid.p.task;
     if (task != MULTI_ROOM && task != UNLOCK && task != UNLOCK_PICKUP && task != KEY_CORRIDOR)

@@ -31,7 +31,7 @@ HD int can_be_entered(int cell) {
 }
 
 // Each obstacle goes to a random free cell around it, if 101 draws find one.
-HD void move_obstacles(Game& g, const Grid& grid) {
+RARE void move_obstacles(Game& g, const Grid& grid) {
     for (int i = 0; i < grid.p.b; i++) {
         int old = inside(grid, g.obstacles[i]), x = old % grid.width, y = old / grid.width;
         int found = place(g, grid, BALL_BLUE, {x - 1, y - 1, 3, 3}, 101);
@@ -97,7 +97,9 @@ HD Outcome play(Game& g, const Grid& grid, int action) {
     if (task == DYNAMIC_OBSTACLES) {
         int front = kind_of(grid.cells[front_of(g, grid)]);
         int is_blocked = front != EMPTY && front != GOAL;
-        move_obstacles(g, grid);
+        Game moved = g;  // as in minigrid_env
+        move_obstacles(moved, grid);
+        g = moved;
         Outcome outcome = act(g, grid, action);
         if (action == FORWARD && is_blocked)
             outcome = {1, 0, 1};
@@ -203,7 +205,9 @@ HD void minigrid_env(const MiniGridStepParams& p, int env, unsigned char* image)
     Outcome outcome = {0, 0, 0};
     int is_reset = g.ended != 0;
     if (is_reset) {
-        new_game(g, grid);
+        Game fresh = g;  // whose address is taken, so that g can stay in registers
+        new_game(fresh, grid);
+        g = fresh;
     } else {
         long long action = p.actions[env];
         int is_known = action >= 0 && action < p.n_actions;
