@@ -75,8 +75,10 @@ def texel_runs(scenery: Scenery, visible: torch.Tensor) -> TexelRuns:
     n_bits = torch.as_tensor(sum(bits >> i & 1 for i in range(WORD)))
     n_visible.index_add_(0, layout, n_bits)
     starts = torch.cat([n_runs.new_zeros(1), n_runs.cumsum(0)])
-    tensors = table.contiguous(), starts.int(), n_visible.int()
-    return TexelRuns(*(tensor.to(device) for tensor in tensors), len(table))
+    runs, starts, n_visible = (
+        tensor.to(device) for tensor in (table.contiguous(), starts.int(), n_visible.int())
+    )
+    return TexelRuns(runs, starts, n_visible, len(table))
 
 
 def _as_signed(bits) -> torch.Tensor:

@@ -207,9 +207,9 @@ def _words(layout, title="", start=0) -> Iterator[Word]:
     for name, kind in _fields(layout):
         at = start + getattr(layout, name).offset
         if issubclass(kind, ctypes.Array):
-            for k in range(kind._length_):
-                place = at + k * ctypes.sizeof(kind._type_)
-                yield from _words(kind._type_, f"{title}{name}.{k}.", place)
+            one: Any = kind._type_
+            for k in range(ctypes.sizeof(kind) // ctypes.sizeof(one)):
+                yield from _words(one, f"{title}{name}.{k}.", at + k * ctypes.sizeof(one))
         elif issubclass(kind, ctypes.Structure):
             yield from _words(kind, f"{title}{name}.", at)
         else:
