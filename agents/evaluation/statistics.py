@@ -108,7 +108,7 @@ def _finite_mean(values) -> np.ndarray:
 
 
 def _divided(sums, counts) -> np.ndarray:
-    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+    return sums / np.where(counts > 0, counts, np.nan)
 
 
 def worst_summary(played: Mapping) -> "Row":

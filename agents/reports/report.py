@@ -5,6 +5,7 @@ Charts are drawn by uPlot (MIT, https://github.com/leeoniya/uPlot), which the pa
 
 import contextlib
 import html
+import itertools
 import json
 import math
 import os
@@ -152,13 +153,12 @@ def _population(every, charts) -> list[str]:
     if n < 2 or not generations:
         return []
     lines = []
-    for member in range(n):
-        own = [rows[member] for rows in generations]
+    for member, own in enumerate(zip(*generations)):
         copied = [f"{r['generation']} from {r['from']}" for r in own if r["from"] != member]
-        line = populations.lineage(generations, member)
-        ancestors = [str(n) for i, n in enumerate(line) if i == 0 or n != line[i - 1]]
+        line = itertools.groupby(populations.lineage(generations, member))
+        ancestors = " → ".join(str(ancestor) for ancestor, _ in line)
         n_diverged = str(sum(int(row.get("diverged", 0)) for row in own))
-        lines.append([str(member), " → ".join(ancestors), ", ".join(copied) or "never", n_diverged])
+        lines.append([str(member), ancestors, ", ".join(copied) or "never", n_diverged])
     x, shown = [int(rows[0]["samples"]) for rows in generations], {}
     scores = np.array([[row.get("score") for row in rows] for rows in generations], float)
     if not np.isnan(scores).all():
