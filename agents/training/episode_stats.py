@@ -11,6 +11,7 @@ import operator
 import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -18,12 +19,16 @@ import torch
 from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.nonfinite import LIMIT
 from megastep.agents.storage.rollout import Rollout
+from megastep.devices import threads
+from megastep.kernels.build.kernel_library import KernelLibrary
+from megastep.kernels.build.launch import launch
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
     from megastep.agents.types import StateDict
 
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 #: Means are over at least this many episodes, once so many have been counted.
 MIN_EPISODES = 100
 #: Intervals whose episodes are counted at a time. The last one grows while all others wait.
@@ -106,6 +111,27 @@ class EpisodeStats:
                 beyond the limit is left out of that metric's mean.
             layouts: (T, B) int32, the layout of each episode, read where `done`. For sources.
         """
+        of_metrics = None
+        if self.metrics:
+            assert metrics is not None
+            of_metrics = torch.stack([metrics[name].float() for name in self.metrics])
+        if not isinstance(learns, torch.Tensor):
+            learns = torch.full_like(done, learns)
+        count = self._count_in_kernel if reward.is_cuda else self._count
+        sums, has_begun = count(reward, reset, done, learns, of_metrics, layouts)
+        began = torch.stack([self.began, self.newest.expand_as(self.began)])  # (2, B)
+        is_in = (began == self.numbers[:, None]).double()  # (K, 2, B)
+        columns = torch.cat([sums[0] * self.members[:, None, None], sums[1:]])  # (C, S, 2, B)
+        self.sums += (columns[:, :, None] * is_in).sum((3, 4))
+        # in place, as a CUDA graph wants it
+        self.began.copy_(torch.where(has_begun, self.newest, self.began))
+
+    def _count(
+        self, reward, reset, done, learns, metrics, layouts
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the sums over the episodes that ended, (1 + sources, S, 2, B): of the episode
+        that began before, and of those after it; and whether an episode began, (B,) bool.
+        """
         reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
         steps = torch.stack([reward.double(), (~reset).double()])
         totals = self.totals[:, None] + steps.cumsum(1)  # (2, T, B), over episodes
@@ -116,36 +142,48 @@ class EpisodeStats:
         returns, lengths = totals - at_end.gather(1, before.expand(2, -1, -1))
         counts = done & learns & (self.is_whole | (before > 0))
         values = torch.stack([torch.ones_like(returns), returns, returns**2, lengths])
-        if self.metrics:
-            assert metrics is not None
-            of_metrics = torch.stack([metrics[name] for name in self.metrics]).double()
-            is_good = of_metrics.abs() <= LIMIT
-            good = torch.where(is_good, of_metrics, 0.0)
-            values = torch.cat([values, good, ~is_good, ~is_good & ~of_metrics.isnan()])
-        # the first that ends in a lane began before this rollout
-        self._add(counts & (before == 0), values, self.began, layouts)
-        self._add(counts & (before > 0), values, self.newest, layouts)
-        # in place, as a CUDA graph wants it
+        if metrics is not None:
+            is_good = metrics.abs() <= LIMIT
+            good = torch.where(is_good, metrics, 0.0)
+            values = torch.cat([values, good, ~is_good, ~is_good & ~metrics.isnan()])
+        each = [counts]
+        if self.sources:
+            last = len(self.source_of_layout) - 1
+            source = self.source_of_layout[layouts.clamp(0, last).long()]
+            is_known = counts & (layouts >= 0) & (layouts <= last)
+            each += [is_known & (source == number) for number in range(len(self.sources))]
+        sums = [
+            torch.stack([torch.where(these & is_part, values, 0.0).sum(1) for is_part in parts], 1)
+            for these in each
+            for parts in [(before == 0, before > 0)]
+        ]
         last_end = ends[-1:]
         self.totals.copy_((totals[:, -1:] - at_end.gather(1, last_end.expand(2, -1, -1)))[:, 0])
         self.is_whole |= last_end[0] > 0
-        self.began.copy_(torch.where((done | reset).any(0), self.newest, self.began))
+        return torch.stack(sums), (done | reset).any(0)
 
-    def _add(self, counts, values, began, layouts) -> None:
-        """Adds the episodes that count, (T, B), of values (S, T, B), to the intervals in which they
-        began, (B,) or ().
-        """
-        of_lanes = torch.where(counts, values, 0.0).sum(1) * self.members[:, None]  # (C, S, B)
-        if self.sources:
-            assert layouts is not None
-            last = len(self.source_of_layout) - 1
-            source = self.source_of_layout[layouts.clamp(0, last).long()]
-            counts = counts & (layouts >= 0) & (layouts <= last)
-            each = [counts & (source == number) for number in range(len(self.sources))]
-            of_sources = [torch.where(these, values, 0.0).sum(1) for these in each]
-            of_lanes = torch.cat([of_lanes, torch.stack(of_sources)])
-        is_in = (began == self.numbers).double().expand(-1, of_lanes.shape[-1])
-        self.sums += of_lanes @ is_in.T
+    def _count_in_kernel(
+        self, reward, reset, done, learns, metrics, layouts
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Does the same in one kernel."""
+        n_steps, n_lanes = reward.shape
+        n_columns = 1 + len(self.sources)
+        sums = self.sums.new_zeros(n_columns, self.sums.shape[1], 2, n_lanes)
+        has_begun = torch.empty_like(self.is_whole)
+        launch(
+            *(LIBRARY, "episodes", reward.device, n_lanes),
+            reward=reward.float().contiguous(),
+            reset=reset.contiguous(),
+            done=done.contiguous(),
+            learns=learns.contiguous(),
+            metrics=metrics,
+            layouts=layouts.contiguous() if self.sources else None,
+            source_of_layout=self.source_of_layout if self.sources else None,
+            **dict(totals=self.totals, is_whole=self.is_whole, has_begun=has_begun, sums=sums),
+            **dict(n_metrics=len(self.metrics), n_layouts=len(self.source_of_layout)),
+            **dict(n_steps=n_steps, n_lanes=n_lanes, n_threads=threads(), limit=LIMIT),
+        )
+        return sums, has_begun
 
     def pop(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums

@@ -306,3 +306,24 @@ def test_a_graph_on_a_gpu_counts_as_the_cpu_does():
         assert graphed.pop() == pytest.approx(plain.pop())
         assert graphed.intervals == plain.intervals
     assert plain.windows[0] and graphed.began.cpu().equal(plain.began)
+
+
+@pytest.mark.parametrize("metrics, sources", [((), None), (("a", "b"), ("s", "t", "s"))])
+def test_kernel_counts_as_pytorch_does(metrics, sources):
+    random = torch.Generator().manual_seed(1)
+    shape = 40, 50
+    group = {"leader": torch.rand(50, generator=random) < 0.5}
+    one, two = (EpisodeStats(50, "cpu", metrics, group, True, sources) for _ in range(2))
+    two._count = two._count_in_kernel
+    for _ in range(6):
+        reward, *others = torch.randn((1 + len(metrics), *shape), generator=random)
+        for tensor, value in zip([reward, *others], (float("nan"), float("inf"), float("nan"))):
+            tensor[torch.rand(shape, generator=random) < 0.1] = value
+        done, late = torch.rand((2, *shape), generator=random) < torch.tensor([[[0.05]], [[0.7]]])
+        reset = torch.cat([done[:1] & False, done[:-1] & late[1:]])
+        learns = torch.rand(shape, generator=random) < 0.8
+        layouts = torch.randint(-1, 4, shape, generator=random, dtype=torch.int32)
+        for stats in one, two:
+            stats.add(reward, reset, done, learns, dict(zip(metrics, others)), layouts)
+        for name in "sums", "totals", "is_whole", "began":
+            assert torch.allclose(getattr(one, name).double(), getattr(two, name).double()), name
