@@ -250,6 +250,9 @@ def sentence(error: Mapping) -> str:
         return f"{value} is out of range: allowed is any finite number"
     for key in BOUNDS.keys() & facts.keys():
         return f"{value} is out of range: allowed is {BOUNDS[key].format(_whole(facts[key]))}"
+    if kind in ("too_short", "too_long"):
+        bound = "at least {min_length}" if kind == "too_short" else "at most {max_length}"
+        return f"has {facts['actual_length']} values: allowed is {bound.format(**facts)}"
     if kind == "literal_error":
         words = re.findall("'([^']*)'", facts["expected"])
         return f"{value!r} is unknown; {closest(value, words)}"

@@ -17,7 +17,7 @@ FOLDERS = DOCS, *(DOCS / name for name in NAMES)
 PAGES = [page for folder in (ROOT, *FOLDERS) for page in folder.glob("*.md")]
 # Commands that need a run, or files that a reader writes, are not composed here.
 NEEDS_FILES = (
-    r"resume=|rerun=|init=|my_package|cores:|encoders:|my_a2c:|safe:|rover:|convoy:|my_rooms:|my_sqlite:"
+    r"resume=|rerun=|init=|my_package|cores:|encoders:|my_a2c:|safe:|rover:|convoy:|my_rooms:|my_grids:|my_sqlite:"
     r"|my_callbacks:|run=RUN|RUN/|my_ppo:|my_schedules:|my_wrappers:|waypoint:|drawn:|flat\.npz"
     r"|--config-dir"
 )

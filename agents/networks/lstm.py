@@ -253,12 +253,12 @@ def lstm_sequence(
     outputs = []
     for t in range(len(x)):
         output, cell = (leaf.masked_fill(reset[t, :, None], 0.0) for leaf in (output, cell))
-        gates = F.linear(x[t], input_weight, bias) + F.linear(output, weight)
+        gates = F.linear(x[t], input_weight, bias) + F.linear(output.to(x.dtype), weight)
         i, f, g, o = gates.float().chunk(4, -1)
         cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()
-        output = o.sigmoid() * cell.tanh()
-        outputs.append(output.to(x.dtype) + x[t] if is_residual else output.to(x.dtype))
-    return torch.stack(outputs), output, cell
+        output = (o.sigmoid() * cell.tanh()).to(x.dtype)
+        outputs.append(output + x[t] if is_residual else output)
+    return torch.stack(outputs), output.float(), cell
 
 
 def _act_on_gpu(core, x, reset, state, is_residual=False) -> tuple[torch.Tensor, arrdict]:

@@ -195,7 +195,7 @@ def test_picture(tmp_path):
 def test_the_pages_example(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "grids.md").read_text(), re.S)
-    (tmp_path / "my_rooms.py").write_text(code)
-    words = ["experiment=minigrid", "env.layouts=my_rooms:corners", "env.limit=100", "device=cpu"]
+    (tmp_path / "my_grids.py").write_text(code)
+    words = ["experiment=minigrid", "env.layouts=my_grids:corners", "env.limit=100", "device=cpu"]
     words += ["env.n_envs=16", "agent.width=8", "samples=2000", "folder=run"]
     assert train.main(words) == 0 and (tmp_path / "run" / "metrics.jsonl").exists()

@@ -44,8 +44,8 @@ TWO_GPUS = [
         (["ranks=all", "device=auto"], 0, "ranks: 'all' uses every GPU, but this machine has none"),
         (["ranks=all", "device=cpu"], 2, "device=cpu; give a number"),
         (["ranks=2", "device=cuda:1"], 2, "device: 'cuda:1' names one GPU"),
-        (["ranks=0"], 2, "ranks: 0 is not a number of ranks"),
-        (["ranks=many"], 2, "ranks: 'many' is not a number of ranks"),
+        (["ranks=0"], 2, "ranks: 0 is out of range: allowed is at least 1"),
+        (["ranks=many"], 2, "ranks: expected an integer, got 'many'"),
     ],
 )
 def test_bad_ranks(here, monkeypatch, capsys, words, n_gpus, cure):

@@ -39,7 +39,7 @@ def test_intake_shape(space, encoder, lead):
     assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
 
 
-@pytest.mark.parametrize("encoder", intakes.ENCODERS)
+@pytest.mark.parametrize("encoder", sorted({*intakes.ENCODERS} - {"categories"}))
 def test_every_pixel_and_leaf_has_a_gradient(encoder):
     torch.manual_seed(0)
     intake = heads.intake(TREE, 512, encoder)

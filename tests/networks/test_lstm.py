@@ -260,6 +260,13 @@ def test_sequence_on_chip_matches_float32_in_every_order(
     assert names <= cuda_on_cpu.launched
 
 
+def test_plain_sequence_in_bfloat16_matches_float32():
+    case = 0, 5, 3, False, False, 16
+    results = whole_sequence(None, "cpu", torch.bfloat16, *case)
+    expected = whole_sequence(None, "cpu", torch.float32, *case)
+    assert_close(NAMES, results, expected, SLACK[torch.bfloat16])
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("n_steps, n_lanes", [(2, 1), (9, 33), (32, 1024), (17, 4100)])
@@ -274,6 +281,7 @@ def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, wi
     assert_close(NAMES, first, expected, SLACK[torch.bfloat16])
     by_steps = whole_sequence(None, "cuda", torch.bfloat16, *case)
     assert_close(NAMES, first, by_steps, SLACK[torch.bfloat16])
+    first, by_steps = ([leaf.cpu() for leaf in leaves] for leaves in (first, by_steps))
     errors = [
         [((leaf - other).norm() / other.norm()).item() for leaf, other in zip(leaves, expected)]
         for leaves in (first, by_steps)

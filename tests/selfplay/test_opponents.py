@@ -74,7 +74,7 @@ def collected(device, has_streams, is_captured=False):
     for n_updates in range(1, 5):
         rollout = collector()
         parts = [getattr(rollout, name) for name in (*SEQUENCES, "values", "state")]
-        tensors += [leaf.clone() for leaf in tree_leaves(parts)]
+        tensors += [leaf.clone() for leaf in tree_leaves(parts) if leaf is not None]
         with torch.no_grad():
             for weight in policy.parameters():
                 weight.mul_(1.5)

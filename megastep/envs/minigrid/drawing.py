@@ -1,9 +1,13 @@
 """Draws a grid of MiniGrid."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from megastep.envs.minigrid.tasks import LIBRARY
-from megastep.plotting.pictures import Area
+
+if TYPE_CHECKING:
+    from megastep.plotting.pictures import Area
 
 __all__ = ["draw"]
 
@@ -14,7 +18,7 @@ KINDS |= {LIBRARY.constants[name]: name for name in ("GOAL", "LAVA", "CLOSED_DOO
 ARROW = np.array([(-0.3, -0.3), (0.38, 0.0), (-0.3, 0.3)])  # of an agent that looks right
 
 
-def draw(area: Area, cells: np.ndarray, agent: np.ndarray, carried: int) -> None:
+def draw(area: "Area", cells: np.ndarray, agent: np.ndarray, carried: int) -> None:
     """Draws cells (H, W), the agent (3,) and, in its corner, what it carries."""
     height, width = cells.shape
     area.fit(np.array([0, 0]), np.array([width, height]))

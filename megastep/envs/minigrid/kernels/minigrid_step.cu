@@ -1,7 +1,8 @@
 // One thread per environment. Then the block writes its images together, four bytes at once.
 #include "minigrid_step.h"
 
-KERNEL minigrid_step(MiniGridStepParams p) {
+// The parameters stay where they are, although functions that are not inlined get their address.
+KERNEL minigrid_step(const MiniGridStepParams __grid_constant__ p) {
     wait_for_previous();
     constexpr int SIZE = 3 * VIEW * VIEW;
     __shared__ __align__(16) unsigned char images[SIZE * BLOCK];
