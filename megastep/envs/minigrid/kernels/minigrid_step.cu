@@ -5,7 +5,8 @@
 KERNEL minigrid_step(const MiniGridStepParams __grid_constant__ p) {
     wait_for_previous();
     constexpr int SIZE = 3 * VIEW * VIEW;
-    __shared__ __align__(16) unsigned char images[SIZE * BLOCK];
+    __shared__ unsigned int words[SIZE * BLOCK / 4];
+    unsigned char* images = (unsigned char*)words;
     int first_env = blockIdx.x * BLOCK, env = first_env + threadIdx.x;
     if (env < p.n_envs)
         minigrid_env(p, env, images + SIZE * threadIdx.x);
@@ -13,7 +14,7 @@ KERNEL minigrid_step(const MiniGridStepParams __grid_constant__ p) {
     int n_bytes = SIZE * mini(BLOCK, p.n_envs - first_env);
     unsigned char* out = p.image + (long long)SIZE * first_env;
     for (int i = threadIdx.x; i < n_bytes / 4; i += BLOCK)
-        ((unsigned int*)out)[i] = ((const unsigned int*)images)[i];
+        ((unsigned int*)out)[i] = words[i];
     for (int i = n_bytes / 4 * 4 + threadIdx.x; i < n_bytes; i += BLOCK)
         out[i] = images[i];
 }
