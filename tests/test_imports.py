@@ -134,6 +134,7 @@ OWN_USERS = {
         "agents/storage/copies.py",
         "agents/storage/replay.py",
         "agents/storage/sum_tree.py",
+        "agents/training/episode_stats.py",
     )
 }
 # The files that may import these packages, directly or through importlib, as glob patterns.
