@@ -82,6 +82,7 @@ _MESSAGES = dict(
     "actions are integers from 0.",
     NAN_ACTION="An agent of environment {env} was given an action that is NaN: continuous actions "
     "are numbers from -1 to 1.",
+    NO_LAYOUT="Environment {env} has a grid in which many draws found no room for an object.",
     BAD_LAYOUT="Environment {env} shows a layout that the scenery does not have: entries of "
     "scenery.layout must be from 0 to the number of layouts - 1.",
     BAD_GOAL="An agent of environment {env} has a goal or a spawn point that its layout does not "

@@ -19,7 +19,6 @@ from megastep.envs.minigrid.tasks import TASKS
 from tests.helpers.pages import ROOT
 from tests.helpers.pong_twins import philox
 
-minigrid = pytest.importorskip("minigrid", minversion="3.2", reason="needs minigrid of Python 3.11")
 KINDS = "key", "ball", "box"
 COLOURS = "red", "green", "blue", "purple", "yellow", "grey"
 
@@ -46,6 +45,7 @@ class OurDraws:
 
 @functools.cache
 def original(id):
+    pytest.importorskip("minigrid", minversion="3.2", reason="needs minigrid of Python 3.11")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a newer version of a task is there
         return gymnasium.make(id, disable_env_checker=True).unwrapped

@@ -14,6 +14,7 @@ constexpr int BAD_ACTION = 2;   // an action outside of the action space
 constexpr int BAD_LAYOUT = 3;   // a layout that the scenery does not have
 constexpr int BAD_GOAL = 4;     // a goal or a spawn point that the layout does not have
 constexpr int NAN_ACTION = 5;   // a continuous action that is NaN
+constexpr int NO_LAYOUT = 6;    // a grid that many draws did not make
 constexpr int BAD_POSE = 6;     // a pose that is not finite, or a size that is not above 0
 constexpr int BAD_COLOUR = 7;   // a colour that the palette does not have
 constexpr int BAD_CARRIER = 8;  // a carrier that is no agent

@@ -38,7 +38,7 @@ constexpr int TURN_LEFT = 0, TURN_RIGHT = 1, FORWARD = 2, PICK_UP = 3, DROP = 4,
               DONE = 6;
 constexpr int RED = 0, GREEN = 1, BLUE = 2, PURPLE = 3, YELLOW = 4, GREY = 5, N_COLOURS = 6;
 constexpr int BALL_BLUE = BALL + 16 * BLUE;
-constexpr int NO_LIMIT = 1 << 30;  // of tries
+constexpr int MAX_TRIES = 10000;  // far more than any task needs
 
 struct Game {
     int x, y, direction;
@@ -122,9 +122,11 @@ HD int place_unless(Game& g, const Grid& grid, int cell, Rectangle in, int n_tri
         grid.cells[place] = (unsigned char)cell;
         return place;
     }
+    if (n_tries == MAX_TRIES)
+        flag_error(grid.p.error_flag, grid.env, NO_LAYOUT);
     return -1;
 }
 
-RARE int place(Game& g, const Grid& grid, int cell, Rectangle in, int n_tries = NO_LIMIT) {
+RARE int place(Game& g, const Grid& grid, int cell, Rectangle in, int n_tries = MAX_TRIES) {
     return place_unless(g, grid, cell, in, n_tries, [](int, int) { return 0; });
 }

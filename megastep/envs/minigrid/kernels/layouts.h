@@ -43,7 +43,7 @@ HD void stand(Game& g, int x, int y, int direction) {
 
 RARE void place_agent(Game& g, const Grid& grid, Rectangle in) {
     stand(g, -1, -1, g.direction);
-    int place_of = place(g, grid, EMPTY, in);
+    int place_of = inside(grid, place(g, grid, EMPTY, in));
     stand(g, place_of % grid.width, place_of / grid.width, draw(g, grid, 0, 4));
 }
 
@@ -147,7 +147,7 @@ HD int add_door(Game& g, const Grid& grid, Rooms& r, int i, int j, int direction
 HD int near_agent(const Game& g, int x, int y) { return absi(g.x - x) + absi(g.y - y) < 2; }
 
 HD void add_object(Game& g, const Grid& grid, const Rooms& r, int i, int j, int cell) {
-    place_unless(g, grid, cell, room(r, i, j), NO_LIMIT,
+    place_unless(g, grid, cell, room(r, i, j), MAX_TRIES,
                  [&](int x, int y) { return near_agent(g, x, y); });
 }
 
@@ -159,11 +159,13 @@ HD int add_random(Game& g, const Grid& grid, const Rooms& r, int i, int j, int k
 
 // In front of nothing, or of a wall.
 HD void place_in_room(Game& g, const Grid& grid, const Rooms& r, int i, int j) {
-    int front;
-    do {
+    for (int k = 0; k < MAX_TRIES; k++) {
         place_agent(g, grid, room(r, i, j));
-        front = kind_of(grid.cells[front_of(g, grid)]);
-    } while (front != EMPTY && front != WALL);
+        int front = kind_of(grid.cells[front_of(g, grid)]);
+        if (front == EMPTY || front == WALL)
+            return;
+    }
+    flag_error(grid.p.error_flag, grid.env, NO_LAYOUT);
 }
 
 RARE void unlock(Game& g, const Grid& grid, int with_box) {
@@ -204,7 +206,9 @@ RARE void key_corridor(Game& g, const Grid& grid) {
     add_object(g, grid, r, 0, draw(g, grid, 0, n_rows), cell_of(KEY, colour));
     place_in_room(g, grid, r, 1, n_rows / 2);
     int start = n_rows / 2 * 3 + 1;
-    while (!are_connected(r, start)) {
+    int n_tries = 0;
+    while (n_tries < MAX_TRIES && !are_connected(r, start)) {
+        n_tries++;
         int i = draw(g, grid, 0, 3), j = draw(g, grid, 0, n_rows), k = draw(g, grid, 0, 4);
         int here = j * 3 + i, there = here + dx_of(k) + 3 * dy_of(k);
         if (!has_neighbour(r, i, j, k) || r.doors[here] >> k & 1 || here == r.locked ||
@@ -212,6 +216,8 @@ RARE void key_corridor(Game& g, const Grid& grid) {
             continue;
         add_door(g, grid, r, i, j, k, CLOSED_DOOR);
     }
+    if (n_tries == MAX_TRIES)
+        flag_error(grid.p.error_flag, grid.env, NO_LAYOUT);
 }
 
 // ---- A chain of rooms ----
@@ -276,8 +282,12 @@ HD int chain_rooms(Game& g, const Grid& grid, ChainedRoom* rooms, int n_rooms) {
 RARE void multi_room(Game& g, const Grid& grid) {
     ChainedRoom rooms[MAX_ROOMS];
     int n_rooms = draw(g, grid, grid.p.a, grid.p.a + 1), colour = -1;
-    while (chain_rooms(g, grid, rooms, n_rooms) < n_rooms)
-        ;
+    int n_chained = 0;
+    for (int i = 0; i < MAX_TRIES && n_chained < n_rooms; i++)
+        n_chained = chain_rooms(g, grid, rooms, n_rooms);
+    if (n_chained < n_rooms)
+        flag_error(grid.p.error_flag, grid.env, NO_LAYOUT);
+    n_rooms = n_chained;
     for (int i = 0; i < n_rooms; i++) {
         wall_around(grid, rooms[i].at);
         if (i == 0)
@@ -287,7 +297,7 @@ RARE void multi_room(Game& g, const Grid& grid) {
         put(grid, rooms[i].door_x, rooms[i].door_y, cell_of(CLOSED_DOOR, colour_by_name(colour)));
     }
     place_agent(g, grid, rooms[0].at);
-    place(g, grid, cell_of(GOAL, GREEN), rooms[n_rooms - 1].at);
+    place(g, grid, cell_of(GOAL, GREEN), rooms[maxi(n_rooms, 1) - 1].at);
 }
 
 // ---- Obstacles ----
@@ -415,7 +425,7 @@ RARE void put_near(Game& g, const Grid& grid) {
             is_there |= objects[i] == object;
         if (is_there)
             continue;
-        places[n] = place_unless(g, grid, object, all_of(grid), NO_LIMIT, [&](int x, int y) {
+        places[n] = place_unless(g, grid, object, all_of(grid), MAX_TRIES, [&](int x, int y) {
             int is_near = 0;
             for (int i = 0; i < n; i++)
                 is_near |=
