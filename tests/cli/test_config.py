@@ -214,7 +214,7 @@ def test_contradicting_settings():
         ("env.res=1025", "env.res", "1025 is out of range: allowed is at most 1,024"),
         ("env.fov=180", "env.fov", "180 is out of range: allowed is below 180"),
         ("seconds=inf", "seconds", "inf is out of range: allowed is any finite number"),
-        ("env.cameras=[]", "env.cameras", "should have at least 1 item"),
+        ("env.cameras=[]", "env.cameras", "has 0 values: allowed is at least 1"),
         ("env.n_envs=2", "learner.n_minibatches", "2"),
         ("learner.anneal=samples", "learner.anneal", "samples="),
         ("seed=" + 3000 * "[", "seed=" + 112 * "[" + "...", "write key=value"),

@@ -43,7 +43,6 @@ BACKEND = """
             statement; \\
     }
 #define BOUNDS(n_blocks)
-#define __grid_constant__
 #define PREFETCH(address)
 constexpr unsigned int FULL_WARP = ~0u;
 """

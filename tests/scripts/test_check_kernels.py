@@ -10,8 +10,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_finds_every_folder_with_cuda_kernels():
     folders = {library.folder.resolve() for library in check_kernels.libraries()}
-    files = [*(ROOT / "megastep").glob("**/*.cu"), *(ROOT / "agents").glob("**/*.cu")]
-    files += [path for path in (ROOT / "megastep").glob("**/*.h") if "\nEACH(" in path.read_text()]
+    files = [file for part in ("megastep", "agents") for file in (ROOT / part).glob("**/*.cu")]
+    for part in "megastep", "agents":
+        headers = (ROOT / part).glob("**/*.h")
+        files += [path for path in headers if "\nEACH(" in path.read_text()]
     assert folders == {file.resolve().parent for file in files}
 
 

@@ -51,11 +51,22 @@ struct Game {
     int obstacles[MAX_OBSTACLES];  // their cells
 };
 
+// What the layout and the steps of a game need: values, so that no function takes the address of
+// the parameters, which a GPU would copy first.
 struct Grid {
-    const MiniGridStepParams& p;
-    unsigned char* cells;
-    int width, height, env;
+    unsigned char* cells;  // (H, W)
+    int width, height, env, task, a, b, sees_through;
+    unsigned int key0, key1;
+    const unsigned char* layouts;
+    const int* starts;
+    int* error_flag;
 };
+
+HD Grid grid_of(const MiniGridStepParams& p, int env) {
+    unsigned char* cells = p.cells + (long long)env * p.width * p.height;
+    return {cells,          p.width, p.height, env,       p.task,   p.a,         p.b,
+            p.sees_through, p.key0,  p.key1,   p.layouts, p.starts, p.error_flag};
+}
 
 // Cells x to x + width - 1 and y to y + height - 1.
 struct Rectangle {
@@ -103,7 +114,7 @@ RARE unsigned int word_of(int env, int draw, unsigned int key0, unsigned int key
 
 // A random integer in [low, high).
 HD int draw(Game& g, const Grid& grid, int low, int high) {
-    unsigned int word = word_of(grid.env, g.n_draws++, grid.p.key0, grid.p.key1);
+    unsigned int word = word_of(grid.env, g.n_draws++, grid.key0, grid.key1);
     return low + (int)((unsigned long long)word * (unsigned int)(high - low) >> 32);
 }
 
@@ -123,7 +134,7 @@ HD int place_unless(Game& g, const Grid& grid, int cell, Rectangle in, int n_tri
         return place;
     }
     if (n_tries == MAX_TRIES)
-        flag_error(grid.p.error_flag, grid.env, NO_LAYOUT);
+        flag_error(grid.error_flag, grid.env, NO_LAYOUT);
     return -1;
 }
 

@@ -51,7 +51,7 @@ RARE void place_agent(Game& g, const Grid& grid, Rectangle in) {
 RARE void empty_room(Game& g, const Grid& grid) {
     put_goal(grid, grid.width - 2, grid.height - 2);
     stand(g, 1, 1, 0);
-    if (grid.p.a)
+    if (grid.a)
         place_agent(g, grid, all_of(grid));
 }
 
@@ -165,7 +165,7 @@ HD void place_in_room(Game& g, const Grid& grid, const Rooms& r, int i, int j) {
         if (front == EMPTY || front == WALL)
             return;
     }
-    flag_error(grid.p.error_flag, grid.env, NO_LAYOUT);
+    flag_error(grid.error_flag, grid.env, NO_LAYOUT);
 }
 
 RARE void unlock(Game& g, const Grid& grid, int with_box) {
@@ -193,8 +193,8 @@ HD int are_connected(const Rooms& r, int start) {
 
 // a: size of the rooms, b: rows.
 RARE void key_corridor(Game& g, const Grid& grid) {
-    int n_rows = grid.p.b;
-    Rooms r = make_rooms(g, grid, grid.p.a, 3, n_rows);
+    int n_rows = grid.b;
+    Rooms r = make_rooms(g, grid, grid.a, 3, n_rows);
     for (int j = 1; j < n_rows; j++) {
         Rectangle middle = room(r, 1, j);
         fill(grid, {middle.x + 1, middle.y, r.size - 2, 1}, EMPTY);
@@ -217,7 +217,7 @@ RARE void key_corridor(Game& g, const Grid& grid) {
         add_door(g, grid, r, i, j, k, CLOSED_DOOR);
     }
     if (n_tries == MAX_TRIES)
-        flag_error(grid.p.error_flag, grid.env, NO_LAYOUT);
+        flag_error(grid.error_flag, grid.env, NO_LAYOUT);
 }
 
 // ---- A chain of rooms ----
@@ -230,7 +230,7 @@ struct ChainedRoom {
 // Draws a room behind a door in one of its walls. Returns 0 if it does not fit.
 HD int chain_room(Game& g, const Grid& grid, ChainedRoom* rooms, int n, int wall_of_door, int x,
                   int y) {
-    int w = draw(g, grid, 4, grid.p.b + 1), h = draw(g, grid, 4, grid.p.b + 1);
+    int w = draw(g, grid, 4, grid.b + 1), h = draw(g, grid, 4, grid.b + 1);
     int left = x, top = y;
     if (n > 0) {
         int is_beside = wall_of_door == TO_RIGHT || wall_of_door == TO_LEFT;
@@ -281,12 +281,12 @@ HD int chain_rooms(Game& g, const Grid& grid, ChainedRoom* rooms, int n_rooms) {
 // a: rooms, b: the largest size of a room.
 RARE void multi_room(Game& g, const Grid& grid) {
     ChainedRoom rooms[MAX_ROOMS];
-    int n_rooms = draw(g, grid, grid.p.a, grid.p.a + 1), colour = -1;
+    int n_rooms = draw(g, grid, grid.a, grid.a + 1), colour = -1;
     int n_chained = 0;
     for (int i = 0; i < MAX_TRIES && n_chained < n_rooms; i++)
         n_chained = chain_rooms(g, grid, rooms, n_rooms);
     if (n_chained < n_rooms)
-        flag_error(grid.p.error_flag, grid.env, NO_LAYOUT);
+        flag_error(grid.error_flag, grid.env, NO_LAYOUT);
     n_rooms = n_chained;
     for (int i = 0; i < n_rooms; i++) {
         wall_around(grid, rooms[i].at);
@@ -325,7 +325,7 @@ constexpr int MAX_RIVERS = 16;
 RARE void crossing(Game& g, const Grid& grid) {
     stand(g, 1, 1, 0);
     put_goal(grid, grid.width - 2, grid.height - 2);
-    int size = grid.width, per_way = (size - 3) / 2, n = grid.p.a;
+    int size = grid.width, per_way = (size - 3) / 2, n = grid.a;
     int rivers[MAX_RIVERS], path[MAX_RIVERS];
     for (int i = 0; i < 2 * per_way; i++)
         rivers[i] = i;
@@ -342,9 +342,9 @@ RARE void crossing(Game& g, const Grid& grid) {
                     across[++n_across] = place;
             }
     for (int i = 1; i <= n_across; i++)
-        fill(grid, {1, across[i], size - 2, 1}, grid.p.b);
+        fill(grid, {1, across[i], size - 2, 1}, grid.b);
     for (int i = 1; i <= n_down; i++)
-        fill(grid, {down[i], 1, 1, size - 2}, grid.p.b);
+        fill(grid, {down[i], 1, 1, size - 2}, grid.b);
     down[n_down + 1] = across[n_across + 1] = size - 1;
     for (int i = 0; i < n; i++)
         path[i] = i >= n_down;  // 0: to the right, over a river that runs down
@@ -365,14 +365,14 @@ RARE void crossing(Game& g, const Grid& grid) {
 RARE void dist_shift(Game& g, const Grid& grid) {
     put_goal(grid, grid.width - 2, 1);
     fill(grid, {3, 1, grid.width - 6, 1}, cell_of(LAVA, RED));
-    fill(grid, {3, grid.p.a, grid.width - 6, 1}, cell_of(LAVA, RED));
+    fill(grid, {3, grid.a, grid.width - 6, 1}, cell_of(LAVA, RED));
     stand(g, 1, 1, 0);
 }
 
 // a: whether the agent starts anywhere, b: obstacles.
 RARE void dynamic_obstacles(Game& g, const Grid& grid) {
     empty_room(g, grid);
-    for (int i = 0; i < grid.p.b; i++)
+    for (int i = 0; i < grid.b; i++)
         g.obstacles[i] = place(g, grid, BALL_BLUE, all_of(grid));
 }
 
@@ -380,8 +380,7 @@ RARE void dynamic_obstacles(Game& g, const Grid& grid) {
 
 // a: whether the hallway's length is random.
 RARE void memory(Game& g, const Grid& grid) {
-    int middle = grid.height / 2,
-        end = grid.p.a ? draw(g, grid, 4, grid.width - 2) : grid.width - 3;
+    int middle = grid.height / 2, end = grid.a ? draw(g, grid, 4, grid.width - 2) : grid.width - 3;
     wall(grid, {1, middle - 2, 4, 1});
     wall(grid, {1, middle + 2, 4, 1});
     wall(grid, {4, middle - 1, 1, 1});
@@ -418,7 +417,7 @@ constexpr int MAX_OBJECTS = 3;
 // b: objects.
 RARE void put_near(Game& g, const Grid& grid) {
     int objects[MAX_OBJECTS], places[MAX_OBJECTS], n = 0;
-    while (n < grid.p.b) {
+    while (n < grid.b) {
         int kind = KEY + draw(g, grid, 0, 3), object = cell_of(kind, draw_colour(g, grid));
         int is_there = 0;
         for (int i = 0; i < n; i++)
@@ -470,15 +469,15 @@ RARE void go_to_door(Game& g, const Grid& grid) {
 
 // A random one of those given. a: how many.
 RARE void custom(Game& g, const Grid& grid) {
-    int i = draw(g, grid, 0, grid.p.a), n_cells = grid.width * grid.height;
+    int i = draw(g, grid, 0, grid.a), n_cells = grid.width * grid.height;
     for (int k = 0; k < n_cells; k++)
-        grid.cells[k] = grid.p.layouts[(long long)i * n_cells + k];
-    stand(g, grid.p.starts[3 * i], grid.p.starts[3 * i + 1], grid.p.starts[3 * i + 2]);
+        grid.cells[k] = grid.layouts[(long long)i * n_cells + k];
+    stand(g, grid.starts[3 * i], grid.starts[3 * i + 1], grid.starts[3 * i + 2]);
 }
 
 RARE void new_game(Game& g, const Grid& grid) {
     fill(grid, all_of(grid), EMPTY);
-    int task = grid.p.task;
+    int task = grid.task;
     if (task != MULTI_ROOM && task != UNLOCK && task != UNLOCK_PICKUP && task != KEY_CORRIDOR)
         wall_around(grid, all_of(grid));
     stand(g, -1, -1, 0);

@@ -1,8 +1,7 @@
 // One thread per environment. Then the block writes its images together, four bytes at once.
 #include "minigrid_step.h"
 
-// The parameters stay where they are, although functions that are not inlined get their address.
-KERNEL minigrid_step(const MiniGridStepParams __grid_constant__ p) {
+KERNEL minigrid_step(MiniGridStepParams p) {
     wait_for_previous();
     constexpr int SIZE = 3 * VIEW * VIEW;
     __shared__ unsigned int words[SIZE * BLOCK / 4];

@@ -32,7 +32,7 @@ HD int can_be_entered(int cell) {
 
 // Each obstacle goes to a random free cell around it, if 101 draws find one.
 RARE void move_obstacles(Game& g, const Grid& grid) {
-    for (int i = 0; i < grid.p.b; i++) {
+    for (int i = 0; i < grid.b; i++) {
         int old = inside(grid, g.obstacles[i]), x = old % grid.width, y = old / grid.width;
         int found = place(g, grid, BALL_BLUE, {x - 1, y - 1, 3, 3}, 101);
         if (found < 0)
@@ -93,7 +93,7 @@ HD int distance(const Grid& grid, int a, int b) {
 
 // One step of a task, with what it adds to the agent's action.
 HD Outcome play(Game& g, const Grid& grid, int action) {
-    int task = grid.p.task, marks[2] = {g.marks[0], g.marks[1]};
+    int task = grid.task, marks[2] = {g.marks[0], g.marks[1]};
     if (task == DYNAMIC_OBSTACLES) {
         int front = kind_of(grid.cells[front_of(g, grid)]);
         int is_blocked = front != EMPTY && front != GOAL;
@@ -182,7 +182,7 @@ HD void write_view(const Game& g, const Grid& grid, unsigned char* image) {
         image[SIZE + k] = (unsigned char)colour_of(cell);
         image[2 * SIZE + k] = (unsigned char)(kind < CLOSED_DOOR ? 0 : kind - CLOSED_DOOR + 1);
     }
-    unsigned long long seen = grid.p.sees_through ? ~0ull : visible_cells(clear);
+    unsigned long long seen = grid.sees_through ? ~0ull : visible_cells(clear);
     for (int k = 0; k < SIZE; k++)
         if (!(seen >> k & 1))
             image[k] = image[SIZE + k] = image[2 * SIZE + k] = 0;
@@ -201,7 +201,7 @@ HD void write_mission(const Game& g, unsigned short* mission) {
 HD void minigrid_env(const MiniGridStepParams& p, int env, unsigned char* image) {
     Game g;
     load_game(g, p.games, p.n_envs, env);
-    Grid grid = {p, p.cells + (long long)env * p.width * p.height, p.width, p.height, env};
+    Grid grid = grid_of(p, env);
     Outcome outcome = {0, 0, 0};
     int is_reset = g.ended != 0;
     if (is_reset) {
