@@ -92,9 +92,11 @@ def warned(prefix: str = "") -> Iterator[None]:
 
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
     """Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it."""
-    if not isinstance(failure.exc_value, OSError):
-        return threading.__excepthook__(failure)
-    warn(f"{failure.thread.name if failure.thread else 'a thread'} stopped: {failure.exc_value}")
+    if isinstance(failure.exc_value, OSError):
+        name = failure.thread.name if failure.thread else "a thread"
+        warn(f"{name} stopped: {failure.exc_value}")
+    else:
+        threading.__excepthook__(failure)
 
 
 def is_unicode() -> bool:

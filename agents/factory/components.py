@@ -26,7 +26,7 @@ OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
 adapter = functools.cache(TypeAdapter)
 
 
-def _wrappers(value: object) -> tuple[object, ...]:
+def _wrappers(value: Any) -> tuple[Any, ...]:
     """Returns the wrappers of an environment: names, and dicts of `name` and settings."""
     items = [value] if isinstance(value, (str, dict)) else value
     for item in items if isinstance(items, (list, tuple)) else [items]:
@@ -37,7 +37,7 @@ def _wrappers(value: object) -> tuple[object, ...]:
             raise ValueError(f"{name!r} is not a wrapper; {closest(name, known)}, or module:Class")
         if name in known or isinstance(item, dict):
             wrapper_settings(item)
-    return tuple(items)  # pyright: ignore[reportArgumentType]
+    return tuple(items)
 
 
 def wrapper_settings(item: "str | dict") -> Any:
