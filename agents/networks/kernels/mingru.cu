@@ -226,6 +226,7 @@ DEVICE void backward(const MingruBackwardParams& p) {
 INSTANCE(BOUNDS(64) mingru_step_float32, MingruForwardParams, run<MingruForward<true>, float>)
 INSTANCE(BOUNDS(64) mingru_step_bfloat16, MingruForwardParams, run<MingruForward<true>, Bfloat16>)
 INSTANCE(BOUNDS(64) mingru_forward_float32, MingruForwardParams, run<MingruForward<false>, float>)
-INSTANCE(BOUNDS(64) mingru_forward_bfloat16, MingruForwardParams, run<MingruForward<false>, Bfloat16>)
+INSTANCE(BOUNDS(64) mingru_forward_bfloat16, MingruForwardParams,
+         run<MingruForward<false>, Bfloat16>)
 INSTANCE(BOUNDS(256) mingru_backward_float32, MingruBackwardParams, backward<float>)
 INSTANCE(BOUNDS(256) mingru_backward_bfloat16, MingruBackwardParams, backward<Bfloat16>)
