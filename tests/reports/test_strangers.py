@@ -56,7 +56,7 @@ def ends_well(main, words, capsys):
     """Whether a command has a result, or ends with one sentence."""
     code, text = main(words), capsys.readouterr().err
     lines = [line for line in text.splitlines() if "warning: " not in line]
-    assert (code, len(lines)) in ((0, 0), (2, 1)), text
+    assert (code, len(lines)) in ((0, 0), (1, 0), (2, 1)), text  # 1: inspect, of what is damaged
     return code
 
 
@@ -153,7 +153,7 @@ def variants(folder):
 
 
 @pytest.mark.parametrize(
-    "every", [pytest.param(12, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)]
+    "every", [pytest.param(50, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)]
 )
 @pytest.mark.parametrize("name", COMMANDS)
 def test_no_string_of_a_population_is_imported(here, name, every, capsys):

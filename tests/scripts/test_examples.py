@@ -36,7 +36,7 @@ def test_command_line(monkeypatch, capsys):
     run(f"--env megastep.envs.pong:Pong {small} --samples 6_000 --log-every 10 limit=20")
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["2,560", "5,120", "5,888"]
-    assert all("  return " in line for line in lines)
+    assert all("  return " in line for line in lines[1:])  # the first episodes have not all ended
     homes = "--homes 3 --samples 512 control=continuous res=64"
     run(f"--env megastep.envs.pointgoal:PointGoal {small} {homes}")
     for words, sentence in {
