@@ -76,7 +76,7 @@ def assert_equal(world, e, obs, reward, terminated, truncated):
 
 
 def play(id, n_envs, n_episodes, seed=3):
-    """Compares episodes of random actions, often forward. Returns how many succeed."""
+    """Compares episodes of random actions, often forward."""
     ours, theirs = envs.MiniGrid(n_envs, id=id, seed=seed, device="cpu"), original(id)
     n_actions = ours.task.n_actions
     weights = torch.ones(n_actions)
@@ -89,7 +89,6 @@ def play(id, n_envs, n_episodes, seed=3):
     worlds = [ours.reset().clone()]
     for t in range(length * n_episodes):
         worlds.append(ours.step(arrdict(actions=actions[:, t, None])).clone())
-    successes = 0
     for e in range(n_envs):
         draws = OurDraws(e, seed)
         theirs._np_random = draws
@@ -103,10 +102,8 @@ def play(id, n_envs, n_episodes, seed=3):
                 obs, reward, terminated, truncated, _ = theirs.step(int(actions[e, t]))
                 t += 1
                 assert_equal(worlds[t], e, obs, reward, terminated, truncated)
-                successes += reward > 0
             t += 1
             done += 1
-    return successes
 
 
 @pytest.mark.parametrize("id", TASKS)

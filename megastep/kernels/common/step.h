@@ -36,3 +36,18 @@ HD void write_outcome(const GameParams& p, int i, float reward, int reset, int a
     p.ended[i] = (unsigned char)ends;
     write_outcome(p, i, reward, reset, ends, rule);
 }
+
+// The state of a game that is a struct of ints: (fields, N) in memory, the fields in their order.
+template <class Game>
+HD void load_game(Game& g, const int* games, long long n_envs, int env) {
+    int* fields = (int*)&g;
+    for (int i = 0; i < (int)(sizeof(Game) / sizeof(int)); i++)
+        fields[i] = games[i * n_envs + env];
+}
+
+template <class Game>
+HD void store_game(const Game& g, int* games, long long n_envs, int env) {
+    const int* fields = (const int*)&g;
+    for (int i = 0; i < (int)(sizeof(Game) / sizeof(int)); i++)
+        games[i * n_envs + env] = fields[i];
+}

@@ -2,19 +2,15 @@
 #pragma once
 #include "common/errors.h"
 #include "common/philox.h"
+#include "common/step.h"
 #include "constants.h"
 
 // N games of W x H cells.
-struct MiniGridStepParams {
+struct MiniGridStepParams : OutcomeParams {
     unsigned char* cells;          // (N, H, W) in and out
     int* games;                    // (GAME_FIELDS, N) in and out: the fields of Game, in order
     const long long* actions;      // (N)
-    float* reward;                 // (N) out, as the next six
-    unsigned char* reset;          // (N)
-    unsigned char* terminal;       // (N)
-    unsigned char* truncated;      // (N)
-    float* metrics;                // (N) 1 where an episode ends with success
-    unsigned char* image;          // (N, 3, VIEW, VIEW)
+    unsigned char* image;          // (N, 3, VIEW, VIEW) out, as the next two
     long long* direction;          // (N) 0 right, 1 down, 2 left, 3 up
     unsigned short* mission;       // (N, N_MISSION) fp16, or null
     const unsigned char* layouts;  // (D, H, W) for CUSTOM, or null
@@ -50,6 +46,7 @@ struct Game {
     int mission[2];                // contents that the mission names; 0: none
     int obstacles[MAX_OBSTACLES];  // their cells
 };
+static_assert(sizeof(Game) == GAME_FIELDS * sizeof(int), "GAME_FIELDS");
 
 // What the layout and the steps of a game need: values, so that no function takes the address of
 // the parameters, which a GPU would copy first.
@@ -72,18 +69,6 @@ HD Grid grid_of(const MiniGridStepParams& p, int env) {
 struct Rectangle {
     int x, y, width, height;
 };
-
-HD void load_game(Game& g, const int* games, long long n_envs, int env) {
-    int* fields = (int*)&g;
-    for (int i = 0; i < GAME_FIELDS; i++)
-        fields[i] = games[i * n_envs + env];
-}
-
-HD void store_game(const Game& g, int* games, long long n_envs, int env) {
-    const int* fields = (const int*)&g;
-    for (int i = 0; i < GAME_FIELDS; i++)
-        games[i * n_envs + env] = fields[i];
-}
 
 HD int absi(int x) { return x < 0 ? -x : x; }
 HD int cell_of(int kind, int colour) { return kind + 16 * colour; }

@@ -219,10 +219,8 @@ HD void minigrid_env(const MiniGridStepParams& p, int env, unsigned char* image)
     }
     store_game(g, p.games, p.n_envs, env);
     double reward = outcome.is_success ? 1.0 - 0.9 * ((double)g.age / (double)p.limit) : 0.0;
-    p.reward[env] = outcome.is_failure ? -1.f : (float)reward;
-    p.reset[env] = (unsigned char)is_reset;
-    p.terminal[env] = (unsigned char)outcome.is_terminal;
-    p.truncated[env] = (unsigned char)(g.ended && !outcome.is_terminal);
+    write_outcome(p, env, outcome.is_failure ? -1.f : (float)reward, is_reset, g.ended,
+                  outcome.is_terminal);
     p.metrics[env] = (float)outcome.is_success;
     p.direction[env] = g.direction;
     write_view(g, grid, image);

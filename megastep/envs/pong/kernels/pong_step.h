@@ -47,18 +47,7 @@ struct Game {
     int n_draws;  // numbers drawn so far, the generator's counter
     int ended;
 };
-
-HD void load_game(Game& g, const int* games, long long n_envs, int env) {
-    int* fields = (int*)&g;
-    for (int i = 0; i < GAME_FIELDS; i++)
-        fields[i] = games[i * n_envs + env];
-}
-
-HD void store_game(const Game& g, int* games, long long n_envs, int env) {
-    const int* fields = (const int*)&g;
-    for (int i = 0; i < GAME_FIELDS; i++)
-        games[i * n_envs + env] = fields[i];
-}
+static_assert(sizeof(Game) == GAME_FIELDS * sizeof(int), "GAME_FIELDS");
 
 // Serves from the centre at a random height, to a random side, up to half a cell up or down per
 // step.
