@@ -118,8 +118,9 @@ def test_floors_are_geometries_or_one():
     assert one.masks.max() == 4 and np.ptp(one.walls[..., 0]) > 12
 
 
-def test_houseexpo():
-    (g,) = plan_of("houseexpo_ok.json").geometries
+@pytest.mark.parametrize("sealed", [True, False])
+def test_houseexpo(sealed):
+    (g,) = plan_of("houseexpo_ok.json", sealed=sealed).geometries
     # the outline of 27.7 m2 is its walls
     x, y = g.walls.astype(float).reshape(-1, 2).T
     assert len(g.walls) == 12 and g.masks.max() == 2
