@@ -34,7 +34,10 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
                 while len(path) > 1 and ".".join(path) not in fields:
                     path.pop()
                 text = sentence(line)
-            errors.setdefault(".".join(path) or "configuration", text)
+            key = ".".join(path) or "configuration"
+            if key in errors and line["type"] == "literal_error":  # another option of a union
+                errors[key] += f"; {line.get('ctx', {})['expected']} is allowed too"
+            errors.setdefault(key, text)
         raise ConfigErrors(errors.items()) from None
     if conflicts := [*getattr(chosen, "conflicts", tuple)()]:
         raise ConfigErrors(conflicts)

@@ -45,7 +45,7 @@ TWO_GPUS = [
         (["ranks=all", "device=cpu"], 2, "device=cpu; give a number"),
         (["ranks=2", "device=cuda:1"], 2, "device: 'cuda:1' names one GPU"),
         (["ranks=0"], 2, "ranks: 0 is out of range: allowed is at least 1"),
-        (["ranks=many"], 2, "ranks: expected an integer, got 'many'"),
+        (["ranks=many"], 2, "ranks: expected an integer, got 'many'; 'all' is allowed too"),
     ],
 )
 def test_bad_ranks(here, monkeypatch, capsys, words, n_gpus, cure):
