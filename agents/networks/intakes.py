@@ -36,11 +36,13 @@ class Encoder(nn.Module):
     """Base of the encoders of a leaf, which map (..., *shape) to (..., n_features).
 
     Attributes:
+        is_normalised: the input is normalised by running statistics.
         takes_parts: the input is normalised, and may be a part of wider rows.
         encode_runs: encodes all runs of an intake together, such as `Conv`'s. None: cannot.
     """
 
     n_features: int
+    is_normalised = True
     takes_parts = False
     encode_runs: Callable[..., torch.Tensor] | None = None
 
@@ -62,6 +64,7 @@ class Flat(Encoder):
 class OneHot(Encoder):
     """One-hot encoding of integers: (..., A) -> (..., A n)."""
 
+    is_normalised = False
     values: torch.Tensor  # (n,)
 
     def __init__(self, space: spaces.MultiDiscrete):
@@ -74,20 +77,30 @@ class OneHot(Encoder):
 
 
 class Categories(Encoder):
-    """One-hot encoding of the pixels of images whose values are categories below `N`, such as
-    MiniGrid's: (..., A, C, H, W) -> (..., A C H W N).
+    """One-hot encoding of MiniGrid's images, whose channels are kind, colour and state of a cell:
+    (..., A, 3, H, W) -> (..., A H W 21). ValueError for images of another number of channels.
     """
 
-    N = 11
-    values: torch.Tensor  # (N,)
+    SIZES = 11, 6, 4  # as minigrid.core.constants has them; a state may be a direction
+    is_normalised = False
+    channels: torch.Tensor  # (21,)
+    values: torch.Tensor  # (21,)
 
-    def __init__(self, space: Space):
+    def __init__(self, space: spaces.MultiImage):
         super().__init__()
-        self.n_features = math.prod(space.shape) * self.N
-        self.register_buffer("values", torch.arange(self.N, dtype=torch.uint8), persistent=False)
+        if space.C != len(self.SIZES):
+            raise ValueError(
+                f"agent.encoder=categories is for images of kinds, colours and states, 3 channels, "
+                f"not {space.C}"
+            )
+        self.n_features = math.prod(space.shape) // space.C * sum(self.SIZES)
+        pairs = [(channel, i) for channel, n in enumerate(self.SIZES) for i in range(n)]
+        for name, numbers in zip(("channels", "values"), zip(*pairs)):
+            self.register_buffer(name, torch.tensor(numbers), persistent=False)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return obs[..., None].eq(self.values).flatten(-5)
+        cells = obs.movedim(-3, -1)
+        return cells.index_select(-1, self.channels).eq(self.values).flatten(-4)
 
 
 #: Encoders of images by name. An encoder is a module `Encoder(space)` with `n_features` that maps
@@ -188,8 +201,8 @@ class ConcatIntake(nn.Module):
         encoders = [make_encoder(leaf, encoder, path) for path, leaf in leaves.items()]
         self.encoders = nn.ModuleList(encoders)
         self.norms = nn.ModuleList(
-            nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else RunningNorm(leaf)
-            for leaf in leaves.values()
+            RunningNorm(leaf) if getattr(encoder, "is_normalised", True) else nn.Identity()
+            for leaf, encoder in zip(leaves.values(), encoders)
         )
         #: whether a kernel may normalise all leaves side by side
         self.is_fused = all(vars(type(encoder)).get("takes_parts") for encoder in encoders)

@@ -28,7 +28,10 @@ def random_obs(space, *lead, seed=0, dtype=torch.float32):
     return space.map(leaf) if isinstance(space, dict) else leaf(space)
 
 
-@pytest.mark.parametrize("encoder", intakes.ENCODERS)
+NUMERIC = sorted({*intakes.ENCODERS} - {"categories"})
+
+
+@pytest.mark.parametrize("encoder", NUMERIC)
 @pytest.mark.parametrize(
     "space", [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)]
 )
@@ -39,7 +42,7 @@ def test_intake_shape(space, encoder, lead):
     assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
 
 
-@pytest.mark.parametrize("encoder", sorted({*intakes.ENCODERS} - {"categories"}))
+@pytest.mark.parametrize("encoder", NUMERIC)
 def test_every_pixel_and_leaf_has_a_gradient(encoder):
     torch.manual_seed(0)
     intake = heads.intake(TREE, 512, encoder)
@@ -110,6 +113,25 @@ def test_normalises_images_per_channel_and_vectors_per_number():
     update(intake, arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
     assert imu_norm.mean[0, 0].item() == 8
     assert imu_norm.scale[0, 0].item() == pytest.approx((137 / 2 - 64) ** 0.5)
+
+
+def test_categories_are_one_hot_whatever_was_seen_before():
+    cells = torch.tensor(
+        [[4, 5, 2], [10, 0, 3], [0, 0, 0]], dtype=torch.uint8
+    )  # kind, colour, state
+    image = cells.T.reshape(1, 1, 3, 1, 3)
+    space = arrdict(image=spaces.MultiImage(1, 3, 1, 3), direction=spaces.MultiDiscrete(1, 4))
+    intake = heads.intake(space, WIDTH, "categories")
+    obs = arrdict(image=image, direction=torch.tensor([[2]]))
+    update(intake, obs)
+    rows = intake.encode(obs)[0, :63].view(3, 21)
+    assert [row.nonzero().flatten().tolist() for row in rows] == [
+        [4, 11 + 5, 17 + 2],
+        [10, 11, 17 + 3],
+        [0, 11, 17],
+    ]
+    with pytest.raises(ValueError, match="3 channels, not 1"):
+        heads.intake(DEPTH, WIDTH, "categories")
 
 
 # ---- On a GPU ----
