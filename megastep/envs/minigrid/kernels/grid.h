@@ -34,7 +34,10 @@ constexpr int TURN_LEFT = 0, TURN_RIGHT = 1, FORWARD = 2, PICK_UP = 3, DROP = 4,
               DONE = 6;
 constexpr int RED = 0, GREEN = 1, BLUE = 2, PURPLE = 3, YELLOW = 4, GREY = 5, N_COLOURS = 6;
 constexpr int BALL_BLUE = BALL + 16 * BLUE;
-constexpr int MAX_TRIES = 10000;  // far more than any task needs
+// Draws of a layout, after which it is given up as it is. Among 20,000 layouts of each task none
+// needs more than 2,300.
+constexpr int MAX_DRAWS = 50000;
+constexpr int MAX_TRIES = MAX_DRAWS;
 
 struct Game {
     int x, y, direction;
@@ -53,16 +56,17 @@ static_assert(sizeof(Game) == GAME_FIELDS * sizeof(int), "GAME_FIELDS");
 struct Grid {
     unsigned char* cells;  // (H, W)
     int width, height, env, task, a, b, sees_through;
+    int first_draw;  // of this step
     unsigned int key0, key1;
     const unsigned char* layouts;
     const int* starts;
     int* error_flag;
 };
 
-HD Grid grid_of(const MiniGridStepParams& p, int env) {
+HD Grid grid_of(const MiniGridStepParams& p, const Game& g, int env) {
     unsigned char* cells = p.cells + (long long)env * p.width * p.height;
-    return {cells,          p.width, p.height, env,       p.task,   p.a,         p.b,
-            p.sees_through, p.key0,  p.key1,   p.layouts, p.starts, p.error_flag};
+    return {cells,          p.width,   p.height, env,    p.task,    p.a,      p.b,
+            p.sees_through, g.n_draws, p.key0,   p.key1, p.layouts, p.starts, p.error_flag};
 }
 
 // Cells x to x + width - 1 and y to y + height - 1.
@@ -97,8 +101,16 @@ RARE unsigned int word_of(int env, int draw, unsigned int key0, unsigned int key
     return philox((unsigned int)env, (unsigned int)draw, key0, key1).a;
 }
 
+// Whether there are draws left in this step. Flags an error if not.
+RARE int may_draw(const Game& g, const Grid& grid) {
+    if ((unsigned int)g.n_draws - (unsigned int)grid.first_draw < (unsigned int)MAX_DRAWS)
+        return 1;
+    flag_error(grid.error_flag, grid.env, NO_LAYOUT);
+    return 0;
+}
+
 // A random integer in [low, high).
-HD int draw(Game& g, const Grid& grid, int low, int high) {
+RARE int draw(Game& g, const Grid& grid, int low, int high) {
     unsigned int word = word_of(grid.env, g.n_draws++, grid.key0, grid.key1);
     return low + (int)((unsigned long long)word * (unsigned int)(high - low) >> 32);
 }
@@ -110,7 +122,7 @@ HD int place_unless(Game& g, const Grid& grid, int cell, Rectangle in, int n_tri
                     IsRejected is_rejected) {
     int left = maxi(in.x, 0), top = maxi(in.y, 0);
     int right = mini(left + in.width, grid.width), bottom = mini(top + in.height, grid.height);
-    for (int i = 0; i < n_tries; i++) {
+    for (int i = 0; i < n_tries && may_draw(g, grid); i++) {
         int x = draw(g, grid, left, right), y = draw(g, grid, top, bottom);
         int place = at(grid, x, y);
         if (grid.cells[place] != EMPTY || (x == g.x && y == g.y) || is_rejected(x, y))
@@ -118,8 +130,6 @@ HD int place_unless(Game& g, const Grid& grid, int cell, Rectangle in, int n_tri
         grid.cells[place] = (unsigned char)cell;
         return place;
     }
-    if (n_tries == MAX_TRIES)
-        flag_error(grid.error_flag, grid.env, NO_LAYOUT);
     return -1;
 }
 

@@ -2,11 +2,9 @@
 #pragma once
 #include "grid.h"
 
-// In the order of their names, which the original draws from.
-HD int colour_by_name(int i) {
-    const int colours[N_COLOURS] = {BLUE, GREEN, GREY, PURPLE, RED, YELLOW};
-    return colours[i];
-}
+// In the order of their names, which the original draws from: blue, green, grey, purple, red and
+// yellow, four bits each.
+HD int colour_by_name(int i) { return 0x403512 >> 4 * i & 15; }
 
 HD int draw_colour(Game& g, const Grid& grid) {
     return colour_by_name(draw(g, grid, 0, N_COLOURS));
@@ -85,14 +83,17 @@ RARE void door_key(Game& g, const Grid& grid) {
 
 // ---- Rooms in rows, of which neighbours share walls ----
 
-constexpr int MAX_ROOMS = 9;
 constexpr int TO_RIGHT = 0, DOWN = 1, TO_LEFT = 2, UP = 3;
+constexpr int MAX_ROOMS = 9;
+constexpr int OFFSET_BITS = 3;
+constexpr int FIRST_WALLS = 0x15555;  // the wall to the right of each room
 
+// Room k = j n_columns + i has wall 2 k on its right, and wall 2 k + 1 below.
 struct Rooms {
     int size, n_columns, n_rows;
-    int doors[MAX_ROOMS];       // a bit for each direction in which one can leave
-    int places[2 * MAX_ROOMS];  // of a door to the right, and of one down
-    int locked;                 // the room behind a locked door
+    int locked;                  // the room behind a locked door
+    int doors;                   // a bit for each wall: whether one can go through
+    unsigned long long offsets;  // how far along each wall its door is
 };
 
 HD Rectangle room(const Rooms& r, int i, int j) {
@@ -104,40 +105,41 @@ HD int has_neighbour(const Rooms& r, int i, int j, int direction) {
     return x >= 0 && y >= 0 && x < r.n_columns && y < r.n_rows;
 }
 
-HD int door_place(const Rooms& r, int i, int j, int direction) {
+HD int wall_of(const Rooms& r, int i, int j, int direction) {
+    int k = j * r.n_columns + i;
     if (direction >= TO_LEFT)
-        return r.places[2 * ((j + dy_of(direction)) * r.n_columns + i + dx_of(direction)) +
-                        direction - 2];
-    return r.places[2 * (j * r.n_columns + i) + direction];
+        k += dx_of(direction) + dy_of(direction) * r.n_columns;
+    return 2 * k + (direction & 1);
+}
+
+HD int door_place(const Grid& grid, const Rooms& r, int i, int j, int direction) {
+    int wall = wall_of(r, i, j, direction), k = wall / 2;
+    int offset = (int)(r.offsets >> OFFSET_BITS * wall) & ((1 << OFFSET_BITS) - 1);
+    int along = r.size - 1, x = k % r.n_columns * along, y = k / r.n_columns * along;
+    return wall & 1 ? at(grid, x + offset, y + along) : at(grid, x + along, y + offset);
 }
 
 HD void connect(Rooms& r, int i, int j, int direction) {
-    r.doors[j * r.n_columns + i] |= 1 << direction;
-    int x = i + dx_of(direction), y = j + dy_of(direction);
-    r.doors[y * r.n_columns + x] |= 1 << (direction ^ 2);
+    r.doors |= 1 << wall_of(r, i, j, direction);
 }
 
 HD Rooms make_rooms(Game& g, const Grid& grid, int size, int n_columns, int n_rows) {
-    Rooms r = {size, n_columns, n_rows, {}, {}, -1};
-    for (int j = 0; j < n_rows; j++)
-        for (int i = 0; i < n_columns; i++)
-            wall_around(grid, room(r, i, j));
-    for (int j = 0; j < n_rows; j++)
-        for (int i = 0; i < n_columns; i++) {
-            int x = i * (size - 1), y = j * (size - 1),
-                *places = r.places + 2 * (j * n_columns + i);
-            if (i < n_columns - 1)
-                places[0] = at(grid, x + size - 1, draw(g, grid, y + 1, y + size - 1));
-            if (j < n_rows - 1)
-                places[1] = at(grid, draw(g, grid, x + 1, x + size - 1), y + size - 1);
-        }
+    Rooms r = {size, n_columns, n_rows, -1, 0, 0};
+    for (int k = 0; k < n_columns * n_rows; k++)
+        wall_around(grid, room(r, k % n_columns, k / n_columns));
+    for (int k = 0; k < n_columns * n_rows; k++)
+        for (int direction = TO_RIGHT; direction <= DOWN; direction++)
+            if (has_neighbour(r, k % n_columns, k / n_columns, direction)) {
+                unsigned long long offset = (unsigned long long)draw(g, grid, 1, size - 1);
+                r.offsets |= offset << OFFSET_BITS * (2 * k + direction);
+            }
     stand(g, n_columns / 2 * (size - 1) + size / 2, n_rows / 2 * (size - 1) + size / 2, 0);
     return r;
 }
 
 HD int add_door(Game& g, const Grid& grid, Rooms& r, int i, int j, int direction, int kind) {
     int colour = draw_colour(g, grid);
-    grid.cells[door_place(r, i, j, direction)] = (unsigned char)cell_of(kind, colour);
+    grid.cells[door_place(grid, r, i, j, direction)] = (unsigned char)cell_of(kind, colour);
     connect(r, i, j, direction);
     if (kind == LOCKED_DOOR)
         r.locked = j * r.n_columns + i;
@@ -159,13 +161,12 @@ HD int add_random(Game& g, const Grid& grid, const Rooms& r, int i, int j, int k
 
 // In front of nothing, or of a wall.
 HD void place_in_room(Game& g, const Grid& grid, const Rooms& r, int i, int j) {
-    for (int k = 0; k < MAX_TRIES; k++) {
+    while (may_draw(g, grid)) {
         place_agent(g, grid, room(r, i, j));
         int front = kind_of(grid.cells[front_of(g, grid)]);
         if (front == EMPTY || front == WALL)
             return;
     }
-    flag_error(grid.error_flag, grid.env, NO_LAYOUT);
 }
 
 RARE void unlock(Game& g, const Grid& grid, int with_box) {
@@ -174,21 +175,18 @@ RARE void unlock(Game& g, const Grid& grid, int with_box) {
     int colour = add_door(g, grid, r, 0, 0, TO_RIGHT, LOCKED_DOOR);
     add_object(g, grid, r, 0, 0, cell_of(KEY, colour));
     place_in_room(g, grid, r, 0, 0);
-    g.marks[0] = with_box ? box : door_place(r, 0, 0, TO_RIGHT);
+    g.marks[0] = with_box ? box : door_place(grid, r, 0, 0, TO_RIGHT);
     g.mission[0] = box;
 }
 
-// Whether one can go from the room of the agent to all.
+// Whether one can go from a room to all. Room k is bit 2 k.
 HD int are_connected(const Rooms& r, int start) {
-    int reached = 1 << start, before;
-    do {
-        before = reached;
-        for (int k = 0; k < r.n_columns * r.n_rows; k++)
-            for (int direction = 0; direction < 4; direction++)
-                if (reached >> k & r.doors[k] >> direction & 1)
-                    reached |= 1 << (k + dx_of(direction) + dy_of(direction) * r.n_columns);
-    } while (reached != before);
-    return reached == (1 << r.n_columns * r.n_rows) - 1;
+    int n_rooms = r.n_columns * r.n_rows, row = 2 * r.n_columns;
+    int right = r.doors & FIRST_WALLS, down = r.doors >> 1 & FIRST_WALLS, reached = 1 << 2 * start;
+    for (int i = 1; i < n_rooms; i++)
+        reached |= (reached & right) << 2 | (reached >> 2 & right) | (reached & down) << row |
+                   (reached >> row & down);
+    return reached == (FIRST_WALLS & ((1 << 2 * n_rooms) - 1));
 }
 
 // a: size of the rooms, b: rows.
@@ -206,18 +204,13 @@ RARE void key_corridor(Game& g, const Grid& grid) {
     add_object(g, grid, r, 0, draw(g, grid, 0, n_rows), cell_of(KEY, colour));
     place_in_room(g, grid, r, 1, n_rows / 2);
     int start = n_rows / 2 * 3 + 1;
-    int n_tries = 0;
-    while (n_tries < MAX_TRIES && !are_connected(r, start)) {
-        n_tries++;
+    while (!are_connected(r, start) && may_draw(g, grid)) {
         int i = draw(g, grid, 0, 3), j = draw(g, grid, 0, n_rows), k = draw(g, grid, 0, 4);
         int here = j * 3 + i, there = here + dx_of(k) + 3 * dy_of(k);
-        if (!has_neighbour(r, i, j, k) || r.doors[here] >> k & 1 || here == r.locked ||
-            there == r.locked)
-            continue;
-        add_door(g, grid, r, i, j, k, CLOSED_DOOR);
+        if (has_neighbour(r, i, j, k) && !(r.doors >> wall_of(r, i, j, k) & 1) &&
+            here != r.locked && there != r.locked)
+            add_door(g, grid, r, i, j, k, CLOSED_DOOR);
     }
-    if (n_tries == MAX_TRIES)
-        flag_error(grid.error_flag, grid.env, NO_LAYOUT);
 }
 
 // ---- A chain of rooms ----
@@ -283,10 +276,8 @@ RARE void multi_room(Game& g, const Grid& grid) {
     ChainedRoom rooms[MAX_ROOMS];
     int n_rooms = draw(g, grid, grid.a, grid.a + 1), colour = -1;
     int n_chained = 0;
-    for (int i = 0; i < MAX_TRIES && n_chained < n_rooms; i++)
+    while (n_chained < n_rooms && may_draw(g, grid))
         n_chained = chain_rooms(g, grid, rooms, n_rooms);
-    if (n_chained < n_rooms)
-        flag_error(grid.error_flag, grid.env, NO_LAYOUT);
     n_rooms = n_chained;
     for (int i = 0; i < n_rooms; i++) {
         wall_around(grid, rooms[i].at);
@@ -416,8 +407,8 @@ constexpr int MAX_OBJECTS = 3;
 
 // b: objects.
 RARE void put_near(Game& g, const Grid& grid) {
-    int objects[MAX_OBJECTS], places[MAX_OBJECTS], n = 0;
-    while (n < grid.b) {
+    int objects[MAX_OBJECTS] = {0, 0, 0}, places[MAX_OBJECTS] = {0, 0, 0}, n = 0;
+    while (n < grid.b && may_draw(g, grid)) {
         int kind = KEY + draw(g, grid, 0, 3), object = cell_of(kind, draw_colour(g, grid));
         int is_there = 0;
         for (int i = 0; i < n; i++)
@@ -437,7 +428,7 @@ RARE void put_near(Game& g, const Grid& grid) {
     int moved = draw(g, grid, 0, n), target;
     do
         target = draw(g, grid, 0, n);
-    while (target == moved);
+    while (target == moved && may_draw(g, grid));
     g.marks[0] = g.mission[0] = objects[moved];
     g.marks[1] = places[target];
     g.mission[1] = objects[target];
@@ -447,12 +438,12 @@ RARE void go_to_door(Game& g, const Grid& grid) {
     int width = draw(g, grid, 5, grid.width + 1), height = draw(g, grid, 5, grid.height + 1);
     fill(grid, all_of(grid), EMPTY);
     wall_around(grid, {0, 0, width, height});
-    int places[4], colours[4], n = 0;
+    int places[4], colours[4] = {0, 0, 0, 0}, n = 0;
     places[0] = at(grid, draw(g, grid, 2, width - 2), 0);
     places[1] = at(grid, draw(g, grid, 2, width - 2), height - 1);
     places[2] = at(grid, 0, draw(g, grid, 2, height - 2));
     places[3] = at(grid, width - 1, draw(g, grid, 2, height - 2));
-    while (n < 4) {
+    while (n < 4 && may_draw(g, grid)) {
         int colour = draw_colour(g, grid), is_there = 0;
         for (int i = 0; i < n; i++)
             is_there |= colours[i] == colour;

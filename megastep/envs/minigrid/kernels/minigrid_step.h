@@ -201,7 +201,7 @@ HD void write_mission(const Game& g, unsigned short* mission) {
 HD void minigrid_env(const MiniGridStepParams& p, int env, unsigned char* image) {
     Game g;
     load_game(g, p.games, p.n_envs, env);
-    Grid grid = grid_of(p, env);
+    Grid grid = grid_of(p, g, env);
     Outcome outcome = {0, 0, 0};
     int is_reset = g.ended != 0;
     if (is_reset) {
