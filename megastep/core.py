@@ -33,6 +33,7 @@ class Core:
         fps: steps per second.
         cameras: yaw offset of each camera in degrees. Default: one camera, straight ahead.
         seed: default seed of the modules built on this core.
+        radius: of the agents, in metres.
 
     Attributes:
         agents: the :class:`~megastep.engine.Agents`.
@@ -48,12 +49,13 @@ class Core:
         fps: float = 10.0,
         cameras: Sequence[float] | None = None,
         seed: int = 1,
+        radius: float = AGENT_RADIUS,
     ):
         self.scenery = checks.instance("scenery", scenery, engine.Scenery)
         self.seed = checks.integer("seed", seed, 0)
         self.n_envs, self.n_agents, self.device = scenery.n_envs, scenery.n_agents, scenery.device
         size = self.n_envs, self.n_agents
-        self.agents = engine.Agents(*size, res, fov, fps, cameras, device=self.device)
+        self.agents = engine.Agents(*size, res, fov, fps, cameras, radius, self.device)
         self.res, self.fov, self.fps = self.agents.res, self.agents.fov, self.agents.fps
 
     def agent_full(self, value: float) -> torch.Tensor:
@@ -77,7 +79,7 @@ class Core:
             vars(objects).update(own, n_envs=1)
             scenery.objects = objects
         yaws = self.agents.yaws.tolist()
-        one = Core(scenery, self.res, self.fov, self.fps, yaws, self.seed)
+        one = Core(scenery, self.res, self.fov, self.fps, yaws, self.seed, self.agents.radius)
         for name in ("positions", "angles", "velocity", "angvelocity"):
             getattr(one.agents, name).copy_(getattr(self.agents, name)[[e]])
         return one
@@ -105,7 +107,8 @@ class Core:
             angles=agents.angles[0].clone(),
             yaws=agents.yaws.clone(),
             fov=torch.tensor(agents.fov),
-            distances=(AGENT_RADIUS + 10 * (1 - depth[0].float())).view(
+            radius=torch.tensor(agents.radius),
+            distances=(agents.radius + 10 * (1 - depth[0].float())).view(
                 self.n_agents, len(agents.yaws), -1
             ),
         )
@@ -161,5 +164,5 @@ class Core:
             if trail is not None:
                 plotting.plot_trail(area, trail[:, a], colour)
             label = str(a) if n_agents > 1 else ""
-            plotting.plot_agent(area, position, angle, AGENT_RADIUS, colour, label)
+            plotting.plot_agent(area, position, angle, state.radius, colour, label)
         return drawn_on

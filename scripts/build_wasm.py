@@ -22,9 +22,9 @@ from megastep.kernels.build.launch import ENGINE
 from megastep.web.page import SHIPPED
 
 LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MEMORY, KEYS, POLICY
-#: Operations of setting up and of scripted bots, which no page launches.
+#: Operations of setting up, of scripted bots and of robots, which no page launches.
 ABSENT = {
-    *("bake", "place_objects", "uniform", "bot"),
+    *("bake", "place_objects", "uniform", "bot", "scan"),
 }
 
 

@@ -1,6 +1,6 @@
-"""Rendering: what cameras see, at full resolution or as observations. N environments, A agents per
-environment, C cameras per agent (the axis is dropped if there is one), R rays per camera, P = R /
-subsample pixels.
+"""Rendering: what cameras see, at full resolution or as observations, and what lidars measure. N
+environments, A agents per environment, C cameras per agent (the axis is dropped if there is one), R
+rays per camera, P = R / subsample pixels.
 """
 
 import math
@@ -10,7 +10,8 @@ import torch
 
 from megastep.devices import n_resident_threads
 from megastep.engine import checks
-from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.agents import MAX_RES, Agents, check_on_cpu
+from megastep.engine.checks import LIMIT
 from megastep.engine.launch_params import (
     lanes_of,
     object_params,
@@ -151,6 +152,41 @@ def observe(
     optional = {**moving, **seen_fields, **out._asdict()}
     _render(scenery, agents, subsample, max_depth, **optional)
     return out
+
+
+def scan(
+    scenery: Scenery,
+    agents: Agents,
+    n_rays: int,
+    range_min: float = 0.0,
+    range_max: float = LIMIT,
+) -> torch.Tensor:
+    """Returns the metres to the nearest wall along rays around each agent, (N, A, n_rays), with the
+    meaning of ROS's LaserScan (REP 117): ray 0 looks ahead, along +x, the others follow
+    counter-clockwise, all 360 / n_rays degrees apart; inf beyond ``range_max``, -inf below
+    ``range_min``. Sees walls only. ValueError if there are objects or several agents.
+    """
+    lanes, device = lanes_of(scenery, agents), scenery.device
+    n_rays = checks.integer("n_rays", n_rays, 1, MAX_RES)
+    checks.number("range_max", range_max, 0, math.inf, "metres")
+    checks.number("range_min", range_min, -1, range_max, "metres")
+    if scenery.n_agents != 1 or scenery.objects is not None:
+        raise ValueError(
+            "scan sees walls only, but the scenery has objects or more than one agent per "
+            "environment: use cameras there"
+        )
+    ranges = torch.empty((*lanes, n_rays), device=device)
+    launch(
+        *(ENGINE, "scan", device, ranges.numel()),
+        **world_params(scenery, agents, "positions", "angles"),
+        ranges=ranges,
+        n_rays=n_rays,
+        pitch=360 / n_rays,
+        range_min=range_min,
+        range_max=range_max,
+    )
+    check_on_cpu(agents)
+    return ranges
 
 
 def _per_camera(scenery, agents) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from pydantic import Field
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
 from megastep.arrdict import arrdict
-from megastep.core import Core
+from megastep.core import AGENT_RADIUS, Core
 from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv
 from megastep.scene import scenery, spread
@@ -53,6 +53,10 @@ class FirstPerson(SceneryEnv):
         With ``control="continuous"``: (B, 1, 3) float32 from -1 to 1: push ahead, push left, turn
         left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
 
+        With ``control="differential"``: (B, 1, 2) float32, the speed ahead in m/s and the rate of
+        turning left in rad/s, within the limits of a :class:`~megastep.modules.Robot`
+        (:class:`~megastep.modules.DifferentialMovement`).
+
     Args:
         n_envs: number of environments, N.
         geometries: floor plans. Default: generated ones, at most 512.
@@ -63,7 +67,8 @@ class FirstPerson(SceneryEnv):
         fov: field of view of a camera, degrees.
         cameras: yaw of each camera, degrees; 0 looks ahead, 90 left.
         fps: steps per second of simulated time.
-        control: discrete or continuous actions.
+        control: discrete, continuous or differential actions.
+        slide: whether walls deflect an agent with differential control. Otherwise they stop it.
         resample: if True, each episode takes place in a randomly drawn floor plan. Otherwise an
             environment keeps its own.
 
@@ -75,6 +80,8 @@ class FirstPerson(SceneryEnv):
     n_agents = 1
     #: Source of the floor plans by default.
     source = "homes"
+    #: The robot that the agents are. None: they are discs that see by cameras.
+    robot: modules.Robot | None = None
     #: Steps after which an episode is truncated.
     limit: int
 
@@ -102,18 +109,24 @@ class FirstPerson(SceneryEnv):
         fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
         cameras: Annotated[Sequence[float], Field(min_length=1, max_length=16)] = (0.0,),
         fps: Annotated[float, Field(ge=1, le=1000)] = 10.0,
-        control: Literal["discrete", "continuous"] = "discrete",
+        control: Literal["discrete", "continuous", "differential"] = "discrete",
+        slide: bool = False,
         resample: bool = False,
     ):
         if geometries is None:
             geometries = sources.sample(self.source, min(n_envs, 512), seed=seed)
         geometries = geometries if resample else spread(geometries, n_envs)
         plans = scenery(geometries, self.n_agents, n_envs=n_envs, seed=seed, device=device)
-        self.core = Core(plans, res, fov, fps, cameras, seed)
+        robot = self.robot
+        radius = AGENT_RADIUS if robot is None else robot.radius
+        self.core = Core(plans, res, fov, fps, cameras, seed, radius)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, n_pixels = subsample, len(modules.downsample(torch.empty(res), subsample))
         self.spawner = self._furnish(geometries, resample)
-        self.movement = modules.MomentumMovement(self.core, control=control)
+        if robot is None and control != "differential":
+            self.movement = modules.MomentumMovement(self.core, control=control)
+        else:
+            self.movement = modules.DifferentialMovement(self.core, robot, slide=slide)
         self.action_space = self.movement.space
         self.obs_space = dotdict(
             rgb=spaces.MultiImage(1, 3, len(cameras), n_pixels, low=0, high=1),

@@ -104,6 +104,14 @@ struct PlaceObjectsParams : WorldParams {
     float apart;  // metres, at least, between what is placed and agents and other objects
 };
 
+struct ScanParams : WorldParams {
+    float* ranges;  // (N, A, R) out: metres; inf beyond range_max, -inf below range_min
+    int n_rays;     // R
+    float pitch;    // degrees from one ray to the next, counter-clockwise
+    float range_min;
+    float range_max;
+};
+
 struct UniformParams {
     const int* counts;          // (B) numbers drawn so far, the generator's counter
     const unsigned char* mask;  // (B) lanes that draw; rows of out of the others stay as they are

@@ -20,6 +20,7 @@ from megastep.modules.movement import (
     to_local,
 )
 from megastep.modules.objects import COLOURS, Crate, Disc, Door, Objects, doorways
+from megastep.modules.robots import DifferentialMovement, Lidar, Robot
 from megastep.modules.sensors import IMU, RGB, Depth, downsample, render
 from megastep.modules.spawning import FreePoints, RandomSpawns, spawn_points
 from megastep.modules.visibility import TEXELS_PER_POINT, visible_texels
@@ -28,4 +29,4 @@ __all__ = ["COLOURS", "ENDLESS", "IMU", "MOVES", "RGB", "TEXELS_PER_POINT", "TUR
 __all__ += ["Depth", "Disc", "Door", "FreePoints", "Lifecycle", "MomentumMovement", "Objects"]
 __all__ += ["RandomLifespans", "RandomSpawns", "CounterGenerator", "SimpleMovement", "doorways"]
 __all__ += ["downsample", "random_ages", "render", "spawn_points", "to_agents", "to_global"]
-__all__ += ["to_lanes", "to_local", "visible_texels"]
+__all__ += ["to_lanes", "to_local", "visible_texels", "DifferentialMovement", "Lidar", "Robot"]

@@ -2,6 +2,7 @@
 
 from megastep.wrappers.actions import ActionRepeat, NoisyActions, StickyActions, TimeLimit
 from megastep.wrappers.base import Wrapper
+from megastep.wrappers.robots import Latency, OdometryDrift
 from megastep.wrappers.worlds import (
     ClipReward,
     DropSensor,
@@ -17,8 +18,10 @@ __all__ = [
     "ClipReward",
     "DropSensor",
     "FrameStack",
+    "Latency",
     "NoisyActions",
     "NoisySensor",
+    "OdometryDrift",
     "ScaleReward",
     "ShapeReward",
     "StickyActions",
@@ -32,8 +35,10 @@ WRAPPERS = {
     "clip_reward": ClipReward,
     "drop_sensor": DropSensor,
     "frame_stack": FrameStack,
+    "latency": Latency,
     "noisy_actions": NoisyActions,
     "noisy_sensor": NoisySensor,
+    "odometry_drift": OdometryDrift,
     "scale_reward": ScaleReward,
     "shape_reward": ShapeReward,
     "sticky_actions": StickyActions,

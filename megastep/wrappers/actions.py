@@ -10,7 +10,7 @@ from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.settings import checked
 from megastep.types import Env, Tree, n_lanes, optional
-from megastep.wrappers.base import Draws, Wrapper, along
+from megastep.wrappers.base import Draws, Levels, Wrapper, along
 
 __all__ = ["ActionRepeat", "NoisyActions", "StickyActions", "TimeLimit"]
 
@@ -74,6 +74,8 @@ class NoisyActions(_Random):
         probability: of a random action, in each step, per agent of a lane.
         std: standard deviation of the noise, in units of half the range of an action. Actions stay
             within their bounds.
+        per_episode: each episode has a probability and a deviation of its own, the same fraction of
+            these, uniform from 0 to 1.
         seed: of the draws.
     """
 
@@ -84,28 +86,36 @@ class NoisyActions(_Random):
         *,
         probability: Probability = 0.1,
         std: Annotated[float, Field(ge=0, le=10)] = 0.1,
+        per_episode: bool = False,
         seed: int = 1,
     ):
         super().__init__(env)
         self.probability, self.std = probability, std
         leaves = spaces.leaves(env.action_space).values()
         self.draws = [Draws(env, space.shape, seed + (i << 40)) for i, space in enumerate(leaves)]
+        self.levels = Levels(env, per_episode, seed)
 
     def before(self, actions: Tree) -> Tree:
         """Returns the actions with noise."""
-        draws = iter(self.draws)
+        draws, levels = iter(self.draws), self.levels.values
 
         def disturb(space, leaf) -> torch.Tensor:
             numbers = next(draws)()
             if isinstance(space, spaces.MultiDiscrete):
                 n = space.n_actions
                 others = (numbers[..., 1] * n).to(leaf.dtype).clamp(max=n - 1)
-                return torch.where(numbers[..., 0] < self.probability, others, leaf)
+                is_random = numbers[..., 0] < along(self.probability * levels, leaf)
+                return torch.where(is_random, others, leaf)
             low, high = space.tensors(leaf.device)
-            noise = self.std * (high - low) / 2 * normal(numbers)
+            noise = along(self.std * levels, leaf) * ((high - low) * 0.5) * normal(numbers)
             return torch.minimum(torch.maximum(leaf + noise, low), high)
 
         return spaces.map(disturb, self.action_space, actions)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Draws how strong the noise is where episodes begin."""
+        self.levels.begin(world.reset)
+        return super().after(world)
 
 
 def normal(numbers: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,7 @@ from megastep.coefficients import Coefficients
 from megastep.modules.lifecycle import CounterGenerator
 from megastep.types import Env, Space, Tree, n_lanes, takes_masks
 
-__all__ = ["Draws", "Wrapper"]
+__all__ = ["Draws", "Levels", "Wrapper"]
 
 
 class Wrapper:
@@ -111,9 +111,27 @@ class Draws:
         self.generator = CounterGenerator(n, seed, env.device)
         self.all = torch.ones(n, dtype=torch.bool, device=env.device)
 
-    def __call__(self) -> torch.Tensor:
-        """Returns (B, *shape, 4) float32, valid until the next call."""
-        return self.generator(self.all).view(self.shape)
+    def __call__(self, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns (B, *shape, 4) float32, valid until the next call: new numbers, or, for the shape
+        (), those of the last call outside of a mask (B,).
+        """
+        return self.generator(self.all if mask is None else mask).view(self.shape)
+
+
+class Levels:
+    """How strong a disturbance is in each lane: 1, or, ``per_episode``, uniform in [0, 1) and drawn
+    where an episode begins.
+    """
+
+    def __init__(self, env: Env, per_episode: bool, seed: int):
+        self.draws = Draws(env, (), seed + (1 << 50)) if per_episode else None
+        self.values = torch.ones(n_lanes(env), device=env.device)
+
+    def begin(self, reset: torch.Tensor) -> torch.Tensor:
+        """Draws the levels of lanes that begin an episode, (B,) bool. Returns all, (B,)."""
+        if self.draws is not None:
+            self.values.copy_(self.draws(reset)[:, 0])
+        return self.values
 
 
 def along(values: torch.Tensor, leaf: torch.Tensor) -> torch.Tensor:

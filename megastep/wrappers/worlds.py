@@ -15,7 +15,7 @@ from megastep.schedules import Number, Scheduled
 from megastep.settings import checked, closest
 from megastep.types import Env, Space, Tree, n_lanes
 from megastep.wrappers.actions import Probability, normal
-from megastep.wrappers.base import Draws, Wrapper, along
+from megastep.wrappers.base import Draws, Levels, Wrapper, along
 
 __all__ = ["ClipReward", "DropSensor", "FrameStack", "NoisySensor", "ScaleReward", "ShapeReward"]
 
@@ -100,21 +100,33 @@ class DropSensor(Wrapper):
     Args:
         sensor: its dotted path in observations, such as `rgb`.
         probability: in each step, per lane.
+        per_value: each value fails by itself, as rays of a lidar do.
+        per_episode: each episode has a probability of its own, uniform from 0 to this one.
         seed: of the draws.
     """
 
     @checked
     def __init__(
-        self, env: Env, *, sensor: str = "", probability: Probability = 1.0, seed: int = 1
+        self,
+        env: Env,
+        *,
+        sensor: str = "",
+        probability: Probability = 1.0,
+        per_value: bool = False,
+        per_episode: bool = False,
+        seed: int = 1,
     ):
         super().__init__(env)
-        _sensor(self, sensor)
-        self.sensor, self.probability, self.draws = sensor, probability, Draws(env, (), seed)
+        shape = _sensor(self, sensor).shape if per_value else ()
+        self.sensor, self.probability, self.draws = sensor, probability, Draws(env, shape, seed)
+        self.levels = Levels(env, per_episode, seed)
 
     def after(self, world: arrdict) -> arrdict:
         """Returns the world without the sensor in some lanes."""
-        leaf = spaces.leaves(world.obs)[self.sensor]
-        fails = along(self.draws()[:, 0] < self.probability, leaf)
+        leaf, numbers = spaces.leaves(world.obs)[self.sensor], self.draws()[..., 0]
+        limits = self.probability * self.levels.begin(world.reset)
+        fails = numbers < along(limits, numbers)
+        fails = fails.view(*fails.shape, *[1] * (leaf.ndim - fails.ndim))
         return arrdict(world, obs=_replaced(world.obs, self.sensor, leaf.masked_fill(fails, 0)))
 
 
@@ -124,6 +136,7 @@ class NoisySensor(Wrapper):
     Args:
         sensor: its dotted path in observations, such as `d`.
         std: standard deviation, in the units of the observation.
+        per_episode: each episode has a deviation of its own, uniform from 0 to this one.
         seed: of the draws.
     """
 
@@ -134,9 +147,11 @@ class NoisySensor(Wrapper):
         *,
         sensor: str = "",
         std: Annotated[float, Field(ge=0, le=10**6)] = 0.1,
+        per_episode: bool = False,
         seed: int = 1,
     ):
         super().__init__(env)
+        self.levels = Levels(env, per_episode, seed)
         space = _sensor(self, sensor)
         if space.dtype == torch.uint8:
             raise ValueError(
@@ -149,7 +164,8 @@ class NoisySensor(Wrapper):
     def after(self, world: arrdict) -> arrdict:
         """Returns the world with noise."""
         leaf = spaces.leaves(world.obs)[self.sensor]
-        noisy = (leaf.float() + self.std * normal(self.draws())).to(leaf.dtype)
+        std = along(self.std * self.levels.begin(world.reset), leaf)
+        noisy = (leaf.float() + std * normal(self.draws())).to(leaf.dtype)
         return arrdict(world, obs=_replaced(world.obs, self.sensor, noisy))
 
 

@@ -7,15 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import torch
 from pydantic import Field
 
-from megastep import modules, spaces
+from megastep import modules, plotting, spaces
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
+from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import Resets
 from megastep.engine.launch_params import seed_params
 from megastep.envs.common import Weight, judged, world_of
 from megastep.envs.first_person import FirstPerson, images
-from megastep.envs.pointgoal.goals import goal_fields
+from megastep.envs.pointgoal.goals import check_doors, goal_fields
 from megastep.geodesics import CELL
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.modules.lifecycle import derived_seed
@@ -41,8 +42,12 @@ class PointGoal(FirstPerson):
         ``goal``: (B, 1, 3), in the agent's frame: straight-line distance / 10 m, cosine and sine
         of the bearing.
 
+        With a ``robot``: ``goal``; ``odom``: (B, 1, 2), the speed ahead and the rate of turning as
+        fractions of the highest; and ``scan``: (B, 1, 1, 1, R), 1 - range / ``range_max`` of R rays
+        counter-clockwise from ahead (:class:`~megastep.modules.Lidar`), or ``rgb``.
+
     Actions:
-        Those of :class:`~megastep.envs.first_person.FirstPerson`.
+        Those of :class:`~megastep.envs.first_person.FirstPerson`; with a ``robot``, differential.
 
     Reward:
         Metres by which the shortest path to the goal became shorter, minus ``cost``, minus
@@ -69,6 +74,7 @@ class PointGoal(FirstPerson):
         privileged: worlds hold ``privileged.way`` (1, 4) for a critic: tens of metres to go by the
             shortest path, the slope of that distance ahead and to the left, and the fraction of the
             steps that is left.
+        robot: what drives: size, limits, lidar. It has differential control. Default: none.
     """
 
     @checked
@@ -82,13 +88,21 @@ class PointGoal(FirstPerson):
         cost: Weight = 0.02,
         walk_cost: Weight = 0.0,
         privileged: bool = False,
+        robot: modules.Robot | None = None,
         **options: Any,
     ):
-        self.range, self.limit = (nearest, furthest), limit
+        self.range, self.limit, self.robot = (nearest, furthest), limit, robot
         super().__init__(*shared, **options)
         self.seed = derived_seed(self.core.seed, "pointgoal")
         self.weights = Coefficients(self.device, bonus=bonus, cost=cost, walk_cost=walk_cost)
         self.coefficients = (self.weights,)
+        if robot is not None:
+            self.lidar = modules.Lidar(self.core, robot)
+            odom = spaces.MultiVector(1, 2, low=-1, high=1)
+            is_lidar = robot.sensor == "lidar"
+            seen = dict(scan=self.lidar.space) if is_lidar else dict(rgb=self.obs_space.rgb)
+            self.obs_space = dotdict(seen, odom=odom)
+            self.per_limit = 1 / self.movement.high
         bounds: dict = dict(low=(0, -1, -1), high=(math.inf, 1, 1))
         self.obs_space["goal"] = spaces.MultiVector(1, 3, **bounds)
         if privileged:
@@ -100,14 +114,24 @@ class PointGoal(FirstPerson):
         self._resets = Resets(lanes_last=("progress",))
 
     def _furnish(self, geometries, resample) -> modules.RandomSpawns:
+        if self.robot is not None:
+            check_doors(geometries, self.robot.radius)
         self.goals, points = goal_fields(geometries, self.core, *self.range)
         return modules.RandomSpawns(geometries, self.core, resample=resample, points=points)
 
     def _world(self, free=None) -> arrdict:
         self.spawner(self.ended)
         out = self._judge(free)
-        obs = arrdict(images(self._view()), goal=out["goal_obs"])
+        obs = arrdict(self._sensed(), goal=out["goal_obs"])
         return world_of(out, obs, METRICS, way="privileged")
+
+    def _sensed(self) -> arrdict:
+        if self.robot is None:
+            return images(self._view())
+        odom = (self.movement.twist() * self.per_limit).half().view(-1, 1, 2)
+        if self.robot.sensor == "lidar":
+            return arrdict(scan=self.lidar().half().view(-1, *self.lidar.space.shape), odom=odom)
+        return arrdict(rgb=images(self._view()).rgb, odom=odom)
 
     def _judge(self, free) -> dict:
         """Rewards agents for getting closer to their goals, and draws those of new episodes."""
@@ -135,7 +159,7 @@ class PointGoal(FirstPerson):
         layout, goal = self.layout[e].long(), self.goal_index[e].long()
         _, _, distance, _, shortest, walked, _ = self.progress[:, e].clone()
         return arrdict(
-            self._seen_by(e),
+            self._seen_by(e) if self.robot is None else dict(scan=self.lidar.state(e)),
             core=self.core.state(e),
             goal=self.goals.points[layout, goal].clone(),
             age=self.ages[e].clone(),
@@ -153,4 +177,10 @@ class PointGoal(FirstPerson):
             f"step {state.age} · {state.distance:.1f} of {state.shortest:.1f} m to go"
             f" · {state.walked:.1f} m walked"
         )
-        return cls._draw(state, title, (state.goal, REACH))
+        if "scan" not in state:
+            return cls._draw(state, title, (state.goal, REACH))
+        figure, plan, strips = plotting.panels(1, title=title)
+        Core.plot_state(state.core, plan)
+        plotting.plot_goal(plan, state.goal, REACH)
+        modules.Lidar.plot_state(state.scan, strips)
+        return figure

@@ -112,6 +112,20 @@ def goal_fields(
     return packed(layouts, allowed, device), torch.from_numpy(spawns).to(device)
 
 
+def check_doors(geometries: Sequence[dotdict], radius: float) -> None:
+    """Raises ValueError, naming the geometry, if a robot of a radius fits through none of the doors
+    and openings of a home, where these are known.
+    """
+    for g in {id(g): g for g in geometries}.values():
+        gaps = np.concatenate([g.get(name, np.empty((0, 2, 2))) for name in ("doors", "openings")])
+        widths = np.linalg.norm(gaps[:, 1] - gaps[:, 0], axis=1)
+        if len(widths) and widths.max() <= 2 * radius:
+            raise ValueError(
+                f"a robot of radius={radius:g} m fits through no door of geometry {g.id}: it needs "
+                f"more than {2 * radius:g} m, and the widest has {widths.max():.2f} m"
+            )
+
+
 def _in_range(layout, nearest, furthest) -> np.ndarray:
     return (layout.lengths >= nearest) & (layout.lengths <= furthest)
 
