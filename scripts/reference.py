@@ -226,7 +226,7 @@ def _word(hint, names):
         return ", ".join(f"`{word}`" for word in inner)
     if names:
         return ", ".join(f"`{word}`" for word in sorted(names)) + " or `module:Class`"
-    if origin in (dict, Any):
+    if origin in (dict, Any) or dataclasses.is_dataclass(origin):
         return "keys with values"
     if inner:
         return f"list of {_word(inner[0], ())}s"

@@ -4,7 +4,8 @@ import contextlib
 import dataclasses
 import difflib
 from collections.abc import Iterable, Iterator
-from typing import Any, TypeVar, cast
+from types import NoneType
+from typing import Any, TypeVar, cast, get_args
 
 from pydantic import ValidationError
 from pydantic_core import PydanticSerializationError, to_jsonable_python
@@ -86,6 +87,8 @@ def fields_of(kind: type, tree: object, prefix: str = "") -> Iterator[tuple[str,
                 with contextlib.suppress(KeyError, TypeError, ValueError):
                     path = components.SINGLE.get(name) or str(member["name"])
                     below = components.kind_of(name, path)
+            if NoneType in get_args(below):
+                below = next(filter(dataclasses.is_dataclass, get_args(below)), below)
             if isinstance(below, type) and dataclasses.is_dataclass(below):
                 yield from fields_of(below, member, f"{key}.")
 

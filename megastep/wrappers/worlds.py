@@ -117,8 +117,9 @@ class DropSensor(Wrapper):
         seed: int = 1,
     ):
         super().__init__(env)
-        shape = _sensor(self, sensor).shape if per_value else ()
-        self.sensor, self.probability, self.draws = sensor, probability, Draws(env, shape, seed)
+        shape = _sensor(self, sensor).shape
+        self.sensor, self.probability = sensor, probability
+        self.draws = Draws(env, shape if per_value else (), seed)
         self.levels = Levels(env, per_episode, seed)
 
     def after(self, world: arrdict) -> arrdict:

@@ -5,18 +5,21 @@ import copy
 import pytest
 import torch
 
-from megastep import contract, engine, envs, spaces, toys
+from megastep import contract, engine, envs, modules, spaces, toys
 from megastep.agents.cli import train
 from megastep.arrdict import arrdict
 from megastep.capture import Captured
+from megastep.modules import Robot
 from megastep.wrappers import (
     WRAPPERS,
     ActionRepeat,
     ClipReward,
     DropSensor,
     FrameStack,
+    Latency,
     NoisyActions,
     NoisySensor,
+    OdometryDrift,
     ScaleReward,
     ShapeReward,
     StickyActions,
@@ -81,8 +84,10 @@ SETTINGS = {
     "clip_reward": {},
     "drop_sensor": dict(sensor="rgb", probability=0.5),
     "frame_stack": dict(n=3),
+    "latency": dict(n=2, per_episode=True),
     "noisy_actions": dict(probability=0.5),
-    "noisy_sensor": dict(sensor="rgb"),
+    "noisy_sensor": dict(sensor="rgb", per_episode=True),
+    "odometry_drift": dict(distance=0.1),
     "scale_reward": dict(factor=0.5),
     "shape_reward": dict(function="tests.envs.test_device_wrappers:length"),
     "sticky_actions": {},
@@ -98,10 +103,10 @@ def length(world):
 @pytest.mark.parametrize("name", WRAPPERS)
 def test_every_wrapper_keeps_the_contract_and_its_state_is_its_environments(name, device):
     """With masked resets, copies and, on a GPU, a CUDA graph of a step."""
-    explorer = envs.ENVS["explorer"](
-        8, geometries=[toys.box()], res=16, subsample=4, device=device, patience=3
-    )
-    env = WRAPPERS[name](explorer, **SETTINGS[name])
+    needs_goal = name == "odometry_drift"
+    kind, options = ("pointgoal", dict(limit=5)) if needs_goal else ("explorer", dict(patience=3))
+    env = envs.ENVS[kind](8, [toys.box()], res=16, subsample=4, device=device, **options)
+    env = WRAPPERS[name](env, **SETTINGS[name])
     contract.rollout(env, 12)
     other = copy.deepcopy(env)
     decision = arrdict(actions=torch.ones(8, 1, dtype=torch.int64, device=device))
@@ -124,6 +129,84 @@ def test_sticky_actions_repeat_a_quarter_but_never_across_episodes():
         n_repeats, n = n_repeats + int(repeated.sum()), n + int((~ended & ~starts).sum())
         last = torch.where(ended, chosen[:, 0].float(), did)
     assert n_repeats / n == pytest.approx(0.25, abs=0.02)
+
+
+@pytest.mark.parametrize("per_episode", [False, True])
+def test_latency_takes_actions_late_and_none_of_the_episode_before(per_episode):
+    """Actions are the step's number. An episode's first actions are 0, as many as its delay."""
+    env = Latency(Counting(3000), n=3, per_episode=per_episode)
+    world, delays = env.reset(), []
+    began = torch.zeros(3000)
+    for t in range(1, 40):
+        delay = env.delays.clone()
+        world = env.step(arrdict(actions=torch.full((3000, 1), t)))
+        began = torch.where(world.reset, t, began)
+        expected = torch.where(t - delay > began, t - delay, 0).masked_fill(world.reset, 0)
+        assert torch.equal(world.obs.did.flatten(), expected.float())
+        delays.append(delay)
+    shares = torch.stack(delays).flatten().bincount(minlength=4) / (39 * 3000)
+    expected = [0.25] * 4 if per_episode else [0, 0, 0, 1]
+    assert shares.tolist() == pytest.approx(expected, abs=0.02)
+
+
+def test_strength_per_episode_is_uniform_and_constant_in_an_episode():
+    n = 4000
+    noisy = NoisySensor(Counting(n), sensor="age", std=2.0, per_episode=True)
+    drops = DropSensor(Counting(n), sensor="age", probability=0.5, per_value=True, per_episode=True)
+    for env, mean in ((noisy, 1.0), (drops, 0.25)):
+        world, seen, levels = env.reset(), [], []
+        for _ in range(60):
+            world = env.step(ones(env))
+            levels.append(env.levels.values.clone())
+            seen.append(world.obs.age.flatten() - env.env.ages)
+        levels, seen = torch.stack(levels), torch.stack(seen)
+        is_first = (levels[1:] != levels[:-1]).float().mean()
+        assert 1 / 9 < is_first < 1 / 5, "episodes have 5 to 7 steps, and one begins them"
+        assert levels.min() < 0.01 and levels.max() > 0.99
+        assert float(levels.mean()) == pytest.approx(0.5, abs=0.01)
+        size = seen.square().mean().sqrt() if env is noisy else (seen != 0).float().mean()
+        expected = 2 / 3**0.5 if env is noisy else mean * (6 / 7)  # age 0 stays 0
+        assert float(size) == pytest.approx(expected, rel=0.1)
+        strong = levels > 0.8
+        assert seen[strong].abs().mean() > 3 * seen[levels < 0.2].abs().mean()
+
+
+def test_odometry_adds_up_the_robots_own_motion_with_the_episodes_errors(device):
+    """Beside dead reckoning in float64, from true poses and what the wrapper drew."""
+    plain = envs.PointGoal(
+        32, [toys.box()], robot=Robot(speed=2.0, accel=20.0), limit=12, device=device
+    )
+    env = OdometryDrift(plain, distance=0.1, turn=0.2, veer=0.3)
+    world, agents = env.reset(), plain.core.agents
+    generator, believed, before, n_apart = torch.Generator().manual_seed(1), None, None, 0
+    bounds = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    for _ in range(40):
+        place, angle = agents.positions[:, 0].cpu().double(), agents.angles[:, 0].cpu().double()
+        if believed is None:
+            believed = torch.cat([place, angle[:, None]], 1)
+        else:
+            moved, turned = place - before[0], (angle - before[1] + 180) % 360 - 180
+            scale = (2 * env.draws.generator.values[:, :3].cpu().double() - 1) * bounds
+            heading = believed[:, 2] + turned * (1 + scale[:, 1])
+            heading += (scale[:, 2] * moved.norm(dim=1)).rad2deg()
+            own = modules.to_global(heading - angle, moved) * (1 + scale[:, :1])
+            believed = torch.cat([believed[:, :2] + own, heading[:, None]], 1)
+            true = torch.cat([place, angle[:, None]], 1)
+            believed = torch.where(world.reset.cpu()[:, None], true, believed)
+        goals = plain.goals.points[plain.layout.long(), plain.goal_index.long()].cpu().double()
+        relative = modules.to_local(believed[:, 2], goals - believed[:, :2])
+        seen = world.obs.goal[:, 0].cpu().double()
+        torch.testing.assert_close(10 * seen[:, :1] * seen[:, 1:], relative, atol=2e-2, rtol=0)
+        n_apart += int(((believed[:, :2] - place).norm(dim=1) > 0.1).sum())
+        before = place, angle
+        actions = plain.movement.high.cpu() * (2 * torch.rand(32, 1, 2, generator=generator) - 0.5)
+        world = env.step(arrdict(actions=actions.to(device)))
+    assert n_apart > 20
+
+
+def test_wrappers_of_robots_say_where_they_do_not_fit():
+    with pytest.raises(ValueError, match=r"OdometryDrift: observations have no goal \(1, 3\)"):
+        OdometryDrift(minimal())
 
 
 def test_noisy_actions_are_uniform_or_nearly_gaussian_within_bounds():

@@ -14,6 +14,7 @@ from megastep.envs import PointGoal
 from megastep.envs.first_person import images
 from megastep.geometries import sample
 from megastep.kernels.build.launch import ENGINE
+from megastep.modules import Robot
 from tests.helpers.synchronisation import no_synchronisation
 
 GPU = torch.cuda.is_available()
@@ -49,6 +50,10 @@ SHORT = {
     "pointgoal, privileged": dict(limit=15, res=1, subsample=1, privileged=True),
     "pointgoal, continuous": dict(
         limit=15, res=1, subsample=1, privileged=True, resample=True, control="continuous"
+    ),
+    "pointgoal, robot": dict(limit=15, res=1, subsample=1, robot=Robot(n_rays=6), resample=True),
+    "pointgoal, robot that slides": dict(
+        limit=15, res=1, subsample=1, robot=Robot(sensor="rgb", speed=9.0, accel=90.0), slide=True
     ),
     "pong": dict(limit=20),
     "pong, pixels": dict(limit=20, pixels=True),
