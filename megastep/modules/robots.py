@@ -13,7 +13,7 @@ from megastep.engine import MAX_RES, checks
 from megastep.settings import frozen
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from matplotlib.axes import Axes
 
@@ -167,7 +167,9 @@ class Lidar:
 
     @staticmethod
     def plot_state(
-        state: np.ndarray, axes: "list[Area | Axes] | None" = None, range_max: float | None = None
+        state: np.ndarray,
+        axes: "Sequence[Area | Axes] | None" = None,
+        range_max: float | None = None,
     ) -> np.ndarray:
         """Draws a numpyified :meth:`state` as one strip per agent, bright where near, from what is
         ahead over the left to the right. Returns the axes.

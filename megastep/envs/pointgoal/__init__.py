@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import torch
 from pydantic import Field
@@ -102,7 +102,8 @@ class PointGoal(FirstPerson):
             is_lidar = robot.sensor == "lidar"
             seen = dict(scan=self.lidar.space) if is_lidar else dict(rgb=self.obs_space.rgb)
             self.obs_space = dotdict(seen, odom=odom)
-            self.per_limit = 1 / self.movement.high
+            self.drive = cast(modules.DifferentialMovement, self.movement)
+            self.per_limit = 1 / self.drive.high
         bounds: dict = dict(low=(0, -1, -1), high=(math.inf, 1, 1))
         self.obs_space["goal"] = spaces.MultiVector(1, 3, **bounds)
         if privileged:
@@ -128,7 +129,7 @@ class PointGoal(FirstPerson):
     def _sensed(self) -> arrdict:
         if self.robot is None:
             return images(self._view())
-        odom = (self.movement.twist() * self.per_limit).half().view(-1, 1, 2)
+        odom = (self.drive.twist() * self.per_limit).half().view(-1, 1, 2)
         if self.robot.sensor == "lidar":
             return arrdict(scan=self.lidar().half().view(-1, *self.lidar.space.shape), odom=odom)
         return arrdict(rgb=images(self._view()).rgb, odom=odom)
