@@ -11,15 +11,13 @@ import torch
 from torch import nn
 
 from megastep.agents.errors import UserError
-from megastep.agents.networks.continuous_outputs import BetaOutput, GaussianOutput
 from megastep.agents.networks.convolutions import Cnn, Conv
-from megastep.agents.networks.cores import CORES, Stack
-from megastep.agents.networks.duelling_output import DuellingOutput
+from megastep.agents.networks.cores import Stack
 from megastep.agents.networks.heads import MultiDiscreteOutput
 from megastep.agents.networks.intakes import ENCODERS, Flat, OneHot
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
-from megastep.agents.networks.plain_cores import GRU, Feedforward
+from megastep.agents.networks.plain_cores import Feedforward
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.web import LIBRARY
@@ -190,21 +188,18 @@ class _Lowering:
             self.linear(x, core.hidden, hidden, width, width, ACTIVATIONS[core.activation])
             self.launch("policy_add", x=hidden, out=x, n=self.n * width)
             return
-        if kind not in (LSTM, GRU, MinGRU):
+        if kind not in (LSTM, MinGRU):
             raise UserError(
                 f"a page has no recurrent core {kind.__name__}; it has "
-                f"agent.core={', '.join(CORES)}"
+                "agent.core=lstm, mingru, none"
             )
-        n = {LSTM: 4, GRU: 3, MinGRU: 2}[kind] * width
+        n = {LSTM: 4, MinGRU: 2}[kind] * width
         gates, output = self.scratch(n), self.state(width)
         cell = self.state(width) if kind is LSTM else None
         self.linear(x, core.input, gates, width, n)
-        recurrent = self.scratch(n) if kind is GRU else None
-        if kind is not MinGRU:
-            self.linear(
-                output, core.recurrent, recurrent or gates, width, n, adds=int(kind is LSTM)
-            )
-        parts = dict(gates=gates, recurrent=recurrent, output=output, cell=cell)
+        if kind is LSTM:
+            self.linear(output, core.recurrent, gates, width, n, adds=1)
+        parts = dict(gates=gates, output=output, cell=cell)
         self.launch(f"policy_{kind.__name__.lower()}", **parts, x=x, width=width)
 
     def state(self, width: int) -> Ref:
@@ -220,41 +215,19 @@ class _Lowering:
     def output(self, x: Ref, width: int) -> Leaf:
         """Adds the output. Returns the logits."""
         output = self.policy.output
-        if not isinstance(
-            output, (MultiDiscreteOutput, DuellingOutput, GaussianOutput, BetaOutput)
-        ):
-            raise UserError("a page has one kind of actions, not a dict of them")
+        if type(output) is not MultiDiscreteOutput:
+            raise UserError(
+                f"a page has no {type(output).__name__}: it has discrete actions of one kind, "
+                "drawn from their probabilities"
+            )
         n_agents, n = output.shape
-        n_logits = n if isinstance(output, (MultiDiscreteOutput, DuellingOutput)) else 2 * n
-        logits = self.scratch(n_agents * n_logits)
-        values: dict = {}
-        operation = "policy_softmax"
-        if isinstance(output, DuellingOutput):
-            operation = "policy_duelling"
-            hidden, scores, value = map(self.scratch, (2 * width, n_agents * n, n_agents))
-            self.linear(x, output.hidden, hidden, width, 2 * width, ACTIVATIONS[torch.relu])
-            # value and advantage each read their half of the hidden layer
-            for layer, out, half in ((output.value, value, 0), (output.advantage, scores, 1)):
-                whole = nn.Linear(2 * width, len(layer.weight))
-                whole.weight.zero_()[:, half * width : (half + 1) * width] = layer.weight
-                whole.bias = layer.bias
-                self.linear(hidden, whole, out, 2 * width, len(layer.weight))
-            values = dict(values=value, epsilon=output.epsilon)
-        else:
-            n_scores = len(output.linear.weight)
-            scores = self.scratch(n_scores)
-            self.linear(x, output.linear, scores, width, n_scores)
-        if isinstance(output, (GaussianOutput, BetaOutput)):
-            operation = "policy_beta"
-            values = dict(low=self.weights(output.low), high=self.weights(output.high))
-        if isinstance(output, GaussianOutput):
-            operation = "policy_gaussian"
-            values |= dict(values=self.weights(output.log_std))
-        key = "numbers" if n_logits > n else "actions"
-        values |= dict(zip(("n_agents", "n_choices", "first"), (n_agents, n, self.lanes.start)))
-        counts = self.program.add(torch.zeros(self.n, dtype=torch.int32))
-        values |= dict(counts=counts, key0=self.seed & 0xFFFFFFFF, key1=self.seed >> 32)
-        values[key] = self.of_lanes(self.program.actions)
-        self.launch(operation, scores=scores, logits=logits, **values)
-        shape = self.n, n_agents, n_logits
-        return Leaf(logits, shape, (n_agents * n_logits, n_logits, 1), torch.float32)
+        scores, logits = self.scratch(n_agents * n), self.scratch(n_agents * n)
+        self.linear(x, output.linear, scores, width, n_agents * n)
+        self.launch(
+            "policy_softmax",
+            **dict(scores=scores, logits=logits, actions=self.of_lanes(self.program.actions)),
+            counts=self.program.add(torch.zeros(self.n, dtype=torch.int32)),
+            **dict(key0=self.seed & 0xFFFFFFFF, key1=self.seed >> 32),
+            **dict(n_agents=n_agents, n_choices=n, first=self.lanes.start),
+        )
+        return Leaf(logits, (self.n, n_agents, n), (n_agents * n, n, 1), torch.float32)

@@ -229,8 +229,7 @@ async function main() {
 
   function action() {
     const values = [...held].map(key => data.controls[key]);
-    if (!Array.isArray(data.rest)) return values.length ? values[game.steps % values.length] : data.rest;
-    return data.rest.map((rest, i) => values.reduce((sum, value) => sum + value[i], rest));
+    return values.length ? values[game.steps % values.length] : 0;
   }
   function step(n = 1) {
     for (let i = 0; i < n; i++) game.step(action());

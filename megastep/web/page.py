@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from megastep import spaces
 from megastep.core import AGENT_RADIUS
 from megastep.kernels.build.compile import EngineError, wasm, wasm_key, wasm_keys, wasm_tools
 from megastep.kernels.build.launch import ENGINE
@@ -27,16 +26,8 @@ SHIPPED = FOLDER / "megastep.wasm"
 ALIGNMENT = 8  # bytes, of buffers in the page's data
 OBJECT_BYTES = ENGINE.constants["OBJECT_BYTES"]
 
-#: By key, in the order of two rows of buttons, the action of `megastep.modules.MOVES` and the
-#: continuous one: ahead, left, turn left.
-KEYS = {
-    "a": (1, [0, 1, 0]),
-    "ArrowUp": (3, [1, 0, 0]),
-    "d": (2, [0, -1, 0]),
-    "ArrowLeft": (5, [0, 0, 1]),
-    "ArrowDown": (4, [-1, 0, 0]),
-    "ArrowRight": (6, [0, 0, -1]),
-}
+#: By key, in the order of two rows of buttons, the action of `megastep.modules.MOVES`.
+KEYS = {"a": 1, "ArrowUp": 3, "d": 2, "ArrowLeft": 5, "ArrowDown": 4, "ArrowRight": 6}
 
 
 def module(program: Program) -> bytes:
@@ -172,10 +163,8 @@ def controls(env: Env) -> dict[str, object]:
     own, space, moves = optional(env, "controls"), env.action_space, hasattr(env, "movement")
     if own is not None:
         return dict(own)
-    if isinstance(space, spaces.MultiContinuous):
-        return {key: pair[1] for key, pair in KEYS.items()} if moves and space.dim == 3 else {}
     if moves and space.n_actions == len(MOVES):
-        return {key: pair[0] for key, pair in KEYS.items()}
+        return KEYS
     return {str(digit): digit for digit in range(min(space.n_actions, 10))}
 
 
@@ -186,15 +175,11 @@ def scene(env: Env, program: Program, homes: Sequence[str] = ()) -> dict:
         program: the recorded environment.
         homes: names of the floor plans, in the order of the layouts.
     """
-    space = env.action_space
-    is_discrete = isinstance(space, spaces.MultiDiscrete)
     shown: dict = {
         "env": type(env).__name__,
         "fps": optional(env, "fps"),
         "n_lanes": n_lanes(env),
         "controls": controls(env),
-        "rest": 0 if is_discrete else [0] * space.dim,
-        "bounds": None if is_discrete else [list(space.low), list(space.high)],
         "homes": list(homes),
     }
     core = getattr(env, "core", None)

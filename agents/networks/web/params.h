@@ -1,6 +1,6 @@
 // The parameters of each launch, passed by value; see megastep/kernels/params.h.
 //
-// B lanes, A agents that one lane controls, n choices or numbers of each, W width. Strides count
+// B lanes, A agents that one lane controls, n choices of each, W width. Strides count
 // numbers from one lane to the next.
 #pragma once
 
@@ -73,11 +73,10 @@ struct PolicyClearParams {
 
 // A step of a recurrent core after its products. Adds its outputs to x.
 struct PolicyCellParams {
-    const float* gates;      // (B, 4 W) of an LSTM, (B, 3 W) of a GRU, (B, 2 W) of a minGRU
-    const float* recurrent;  // (B, 3 W) the GRU's product of its last outputs
-    float* output;           // (B, W) the hidden state, in and out, as the next
-    float* cell;             // (B, W) the LSTM's
-    float* x;                // (B, W)
+    const float* gates;  // (B, 4 W) of an LSTM, (B, 2 W) of a minGRU
+    float* output;       // (B, W) the hidden state, in and out, as the next
+    float* cell;         // (B, W) the LSTM's
+    float* x;            // (B, W)
     int width;
     int n_lanes;
 };
@@ -88,22 +87,17 @@ struct PolicyAddParams {
     int n;
 };
 
-// Turns what an output's linear layers return into logits and actions.
+// Turns what an output's linear layer returns into log-probabilities and actions.
 struct PolicyActParams {
-    const float* scores;   // (B, A n); of a Beta distribution (B, A 2 n)
-    const float* values;   // (B, A) the duelling network's; (A, n) the Gaussian's raw log_std
-    const float* low;      // (n) bounds of continuous actions
-    const float* high;     // (n)
-    float* logits;         // (B, A n); (B, A 2 n) of continuous actions
-    long long* actions;    // (B, A) one or the other
-    float* numbers;        // (B, A, n)
+    const float* scores;   // (B, A n)
+    float* logits;         // (B, A n)
+    long long* actions;    // (B, A)
     unsigned int* counts;  // (B) in and out: the generator's counter
     unsigned int key0;     // the seed
     unsigned int key1;
     int first;      // the first lane's number
     int n_agents;   // A
     int n_choices;  // n
-    int greedy;     // 1: the most likely or best actions
-    float epsilon;  // of the duelling network
+    int greedy;     // 1: the most likely actions
     int n_lanes;
 };

@@ -10,8 +10,6 @@ constexpr int BLOCK = 16;  // channels whose sums stay in registers
 
 static float sigmoid(float x) { return 1.f / (1.f + expf(-x)); }
 
-static float softplus(float x) { return x > 20.f ? x : log1pf(expf(x)); }
-
 static float activated(float x, int activation) {
     return activation == 1 ? (x > 0.f ? x : 0.f) : activation == 2 ? tanhf(x) : x;
 }
@@ -145,21 +143,6 @@ KERNEL policy_lstm(const PolicyCellParams& p) {
     }
 }
 
-KERNEL policy_gru(const PolicyCellParams& p) {
-    int width = p.width;
-    for (int lane = 0; lane < p.n_lanes; lane++) {
-        const float *input = p.gates + 3ll * lane * width, *last = p.recurrent + 3ll * lane * width;
-        for (int i = 0; i < width; i++) {
-            long long at = (long long)lane * width + i;
-            float reset = sigmoid(input[i] + last[i]);
-            float update = sigmoid(input[width + i] + last[width + i]);
-            float candidate = tanhf(input[2 * width + i] + reset * last[2 * width + i]);
-            p.output[at] = candidate + update * (p.output[at] - candidate);
-            p.x[at] += p.output[at];
-        }
-    }
-}
-
 KERNEL policy_mingru(const PolicyCellParams& p) {
     int width = p.width;
     for (int lane = 0; lane < p.n_lanes; lane++) {
@@ -178,33 +161,10 @@ KERNEL policy_add(const PolicyAddParams& p) {
         p.out[i] += p.x[i];
 }
 
-// Draws of one lane, by the generator of megastep.
-struct Draws {
-    const PolicyActParams& p;
-    int lane;
-
-    Philox bits() const {
-        return philox((unsigned int)(p.first + lane), p.counts[lane]++, p.key0, p.key1);
-    }
-
-    float uniform() const { return unit_float(bits().a); }
-
-    float normal() const {  // Box and Muller 1958
-        Philox x = bits();
-        return sqrtf(-2.f * logf(1.f - unit_float(x.a))) * cosf(6.28318531f * unit_float(x.b));
-    }
-
-    float gamma(float shape) const {  // Marsaglia and Tsang 2000, for shapes from 1
-        float d = shape - 1.f / 3.f, c = 1.f / sqrtf(9.f * d);
-        for (int i = 0; i < 1000; i++) {
-            float x = normal(), v = 1.f + c * x, u = 1.f - uniform();
-            v = v * v * v;
-            if (v > 0.f && logf(u) < 0.5f * x * x + d - d * v + d * logf(v))
-                return d * v;
-        }
-        return d;
-    }
-};
+// A number in [0, 1) for one lane, by the generator of megastep.
+static float uniform(const PolicyActParams& p, int lane) {
+    return unit_float(philox((unsigned int)(p.first + lane), p.counts[lane]++, p.key0, p.key1).a);
+}
 
 static int best_of(const float* logits, int n) {
     int best = 0;
@@ -225,7 +185,7 @@ KERNEL policy_softmax(const PolicyActParams& p) {
             logits[i] = scores[i] - most - logf(sum);
         int action = best_of(logits, n);
         if (!p.greedy) {
-            float left = Draws{p, row / p.n_agents}.uniform();
+            float left = uniform(p, row / p.n_agents);
             for (int i = 0; i < n; i++) {
                 left -= expf(logits[i]);
                 if (left < 0.f) {
@@ -235,64 +195,5 @@ KERNEL policy_softmax(const PolicyActParams& p) {
             }
         }
         p.actions[row] = action;
-    }
-}
-
-KERNEL policy_duelling(const PolicyActParams& p) {
-    int n = p.n_choices;
-    for (int row = 0; row < p.n_lanes * p.n_agents; row++) {
-        const float* scores = p.scores + (long long)row * n;
-        float *logits = p.logits + (long long)row * n, sum = 0.f;
-        for (int i = 0; i < n; i++)
-            sum += scores[i];
-        for (int i = 0; i < n; i++)
-            logits[i] = p.values[row] + scores[i] - sum / (float)n;
-        int action = best_of(logits, n);
-        if (!p.greedy) {
-            Philox x = Draws{p, row / p.n_agents}.bits();
-            int random = (int)(unit_float(x.a) * (float)n);
-            action = unit_float(x.b) < p.epsilon ? random : action;
-        }
-        p.actions[row] = action;
-    }
-}
-
-// A number from -1 to 1 as an action within the bounds.
-static float bounded(const PolicyActParams& p, int i, float x) {
-    float low = p.low[i], high = p.high[i], action = low + (high - low) * (x + 1.f) / 2.f;
-    return action < low ? low : action > high ? high : action;
-}
-
-KERNEL policy_gaussian(const PolicyActParams& p) {
-    const float most = 5.f, least = -3.f;  // of the mean, and of the standard deviation's logarithm
-    int n = p.n_choices;
-    for (int row = 0; row < p.n_lanes * p.n_agents; row++) {
-        const float* scores = p.scores + (long long)row * n;
-        float* logits = p.logits + 2ll * row * n;
-        for (int i = 0; i < n; i++) {
-            float raw = p.values[row % p.n_agents * n + i];
-            logits[i] = most * tanhf(scores[i] / most);
-            logits[n + i] = least + softplus(raw - least);
-            float noise = p.greedy ? 0.f : Draws{p, row / p.n_agents}.normal();
-            float x = tanhf(logits[i] + expf(logits[n + i]) * noise);
-            p.numbers[(long long)row * n + i] = bounded(p, i, x);
-        }
-    }
-}
-
-KERNEL policy_beta(const PolicyActParams& p) {
-    int n = p.n_choices;
-    for (int row = 0; row < p.n_lanes * p.n_agents; row++) {
-        const float* scores = p.scores + 2ll * row * n;
-        float* logits = p.logits + 2ll * row * n;
-        for (int i = 0; i < 2 * n; i++)
-            logits[i] = 1.f + softplus(scores[i]);
-        for (int i = 0; i < n; i++) {
-            Draws draws = {p, row / p.n_agents};
-            float alpha = p.greedy ? logits[i] : draws.gamma(logits[i]);
-            float beta = p.greedy ? logits[n + i] : draws.gamma(logits[n + i]);
-            float x = 2.f * alpha / (alpha + beta) - 1.f;
-            p.numbers[(long long)row * n + i] = bounded(p, i, x);
-        }
     }
 }
