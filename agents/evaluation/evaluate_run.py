@@ -26,8 +26,8 @@ def run(cfg: settings.Evaluate) -> Path:
 
     Writes .json, .md and .csv, which has a row per episode, into the run's folder `evaluations`,
     one of each per source of geometries (per environment where it has none), split and checkpoint.
-    Of `geometry=suite` plays as many episodes in each source, and adds the worst source and the
-    worst dense homes. With `cfg.against` plays duels; with `cfg.ratings` writes ratings.csv.
+    Of `geometry=suite` plays as many episodes in each source. With `cfg.against` plays duels; with
+    `cfg.ratings` writes ratings.csv.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
@@ -63,12 +63,14 @@ def _measure(cfg, loaded, env_settings, geometry, homes, options) -> Path:
     if process_group.rank() > 0:
         return folders.folder_of(loaded.path)
     is_duel, is_suite = cfg.against is not None, geometry.name == components.SUITE
+    who = "against" if is_duel else "agent"
+    order = [*dict.fromkeys(row[who] for row in rows)]
+    rows.sort(key=lambda row: order.index(row[who]))  # all sources of one after the other
     n_homes = {row.get("source"): row["homes"] or 0 for row in reversed(rows)}
     n_homes = n_homes.get(None) or sum(n_homes.values())
     what = f"{rows[0]['duels']:,} duels" if is_duel else f"{rows[0]['lanes']:,} episodes"
     what += " in each source" * is_suite
     title = tables.title_of(where, geometry, cfg.split, what, n_homes)
-    rows = tables.with_worst_sources(rows, "against" if is_duel else "agent") if is_suite else rows
     names = [tables.source_of(where, geometry), "env" * (cfg.env is not None), cfg.split]
     if cfg.against is not None:
         names = ["duels", names[0], cfg.split, str(loaded.step), "against", *cfg.against]
@@ -140,7 +142,4 @@ def _play(
 
 def _rows(where, played, source) -> "list[Row]":
     sources = factory.sources_of(where.homes) if source is None else None
-    rows = statistics.summaries(played, optional(where.env, "roles"), sources)
-    if source == tables.DENSE and "homes" in played:
-        rows.append({"tail": statistics.TAIL, **statistics.worst_summary(played)})
-    return rows
+    return statistics.summaries(played, optional(where.env, "roles"), sources)

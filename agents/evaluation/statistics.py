@@ -1,4 +1,4 @@
-"""Means of episodes with their confidence intervals, overall and in the worst homes."""
+"""Means of episodes with their confidence intervals."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 ENDS = "cut off", "truncated", "terminal"
 #: What tells how well an episode went, the first that there is; homes of all sizes compare by it.
 SCORES = "success", "coverage", "won", "return"
-TAIL = 0.05  # fraction of homes that `worst_homes` averages
 BOUNDS = "mean", "lower", "upper"
 
 
@@ -60,73 +59,6 @@ def interval(
     drawn = resamples(len(sums), n_resamples, seed)
     lower, upper = bounds(sums[drawn].sum(1) / counts[drawn].sum(1), level)
     return float(values.mean()), float(lower), float(upper)
-
-
-def score_of(row: Mapping) -> float:
-    """Returns the mean of the first of `SCORES` that a table row has."""
-    values = {k: row[k] for k in ("won", "return") if k in row}
-    values |= {name: metric["mean"] for name, metric in row.get("metrics", {}).items()}
-    return next(values[name] for name in SCORES if values.get(name) is not None)
-
-
-def worst_homes(
-    columns: Mapping[str, ArrayLike], homes: ArrayLike
-) -> tuple[np.ndarray, dict[str, dict[str, float | None]]]:
-    """Returns the numbers of the worst `TAIL` of all homes, and {name: {mean, lower, upper}} of
-    `columns` in them, None for each if no episode in them has a number.
-
-    Homes are ordered by the mean, over their episodes, of the first of `SCORES` among the columns;
-    in the worst, that mean is the conditional value at risk (CVaR; Rockafellar and Uryasev 2000).
-    Intervals are from resampling homes, of which the worst are taken anew.
-
-    Args:
-        columns: name -> (B,). What is not finite is left out of a home's mean.
-        homes: (B,) integers, the home of each episode.
-    """
-    numbers, homes = np.unique(np.asarray(homes), return_inverse=True)
-    means = {}
-    for name, values in columns.items():
-        values, is_finite = np.asarray(values, float), np.isfinite(values)
-        sums = np.bincount(homes, np.where(is_finite, values, 0.0))
-        means[name] = _divided(sums, np.bincount(homes, is_finite))
-    # of homes with equal scores, those that do worse by the next score come first
-    order = np.lexsort([means[name] for name in reversed(SCORES) if name in means])
-    n_worst, drawn = max(1, round(TAIL * len(numbers))), resamples(len(numbers))
-    worst = order[np.sort(order.argsort()[drawn], 1)[:, :n_worst]]
-    result = {}
-    for name, by_home in means.items():
-        mean, resampled = _finite_mean(by_home[order[:n_worst]]), _finite_mean(by_home[worst])
-        values = [float(mean), *bounds(resampled).tolist()] if np.isfinite(mean) else 3 * [None]
-        result[name] = dict(zip(BOUNDS, values, strict=True))
-    return numbers[order[:n_worst]], result
-
-
-def _finite_mean(values) -> np.ndarray:
-    """Over the last axis, of what is finite; nan if there is none."""
-    is_finite = np.isfinite(values)
-    return _divided(np.where(is_finite, values, 0.0).sum(-1), is_finite.sum(-1))
-
-
-def _divided(sums, counts) -> np.ndarray:
-    return sums / np.where(counts > 0, counts, np.nan)
-
-
-def worst_summary(played: Mapping) -> "Row":
-    """Returns a table row of the worst homes, `worst_homes`, from the result of `first_episodes`
-    or `first_duels`, without unfinished episodes and metrics without a number.
-    """
-    played = numpyify(played)
-    lanes, score = _counted(played), "return"
-    if "score" in played:
-        score, columns = "won", {"won": played["score"]}
-    else:
-        lanes, columns = lanes & played["done"], {**played["metrics"], "return": played["returns"]}
-    columns = {name: values[lanes] for name, values in columns.items()}
-    columns = {name: values for name, values in columns.items() if np.isfinite(values).any()}
-    numbers, means = worst_homes(columns, played["homes"][lanes])
-    row = _summary(played, lanes & np.isin(played["homes"], numbers))
-    row |= dict(zip((score, *BOUNDS[1:]), means.pop(score).values(), strict=True))
-    return row | ({"metrics": means} if "metrics" in row else {})
 
 
 def _counted(played) -> np.ndarray:

@@ -9,7 +9,6 @@ from pathlib import Path
 from megastep.agents import console
 from megastep.agents.errors import user_errors
 from megastep.agents.evaluation.eval_env import EvalEnv
-from megastep.agents.evaluation.statistics import score_of
 from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree
 from megastep.agents.factory.settings import Evaluate, Geometry, env_name, label
@@ -19,8 +18,6 @@ from megastep.agents.runs.typed_json import encoded
 from megastep.atomic_files import write_atomically
 
 INTERVAL = "95 % interval"
-#: The source of a suite of which the worst homes have a row of their own.
-DENSE = "dense"
 
 
 def title_of(where: EvalEnv, geometry: Geometry, split: str, what: str, n_homes: int | None) -> str:
@@ -131,10 +128,8 @@ def duel_cells(row: dict) -> dict[str, str]:
 
 def part_of(row: dict) -> str:
     """Returns which of its agent's episodes a row has, `: hunter` or `, in maze`; empty for all."""
-    worst = f", worst {row['tail']:.0%} of homes" if "tail" in row else ""
-    worst += ", the worst source" * row.get("is_worst", False)
     role = f": {row['role']}" if "role" in row else ""
-    return role + (f", in {row['source']}{worst}" if "source" in row else "")
+    return role + (f", in {row['source']}" if "source" in row else "")
 
 
 # ---- Suites: geometries of several sources, which are evaluated one by one ----
@@ -148,15 +143,3 @@ def parts_of(geometry: Geometry, homes: list) -> list[tuple[str | None, list]]:
     for home in homes:
         parts.setdefault(home["source"], []).append(home)
     return [*parts.items()]
-
-
-def with_worst_sources(rows: list[dict], who: str) -> list[dict]:
-    """Returns the rows of a suite with the worst source of each agent or opponent, by the key
-    `who`, once more at its end.
-    """
-    ordered = []
-    for one in dict.fromkeys(row[who] for row in rows):
-        of_one = [row for row in rows if row[who] == one]
-        whole = [row for row in of_one if not {"role", "tail"} & row.keys()]
-        ordered += [*of_one, {**min(whole, key=score_of), "is_worst": True}]
-    return ordered

@@ -297,14 +297,3 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
     table = json.loads(path.read_text())
     assert table["rows"][0]["homes"] == 7
     assert "matrix: 28 duels in 7 homes, geometry=homes, split=test, seed 1" in table["title"]
-
-
-def test_worst_homes_of_duels():
-    """Of 20 homes, in home 7 both duels are lost."""
-    homes = torch.arange(20).repeat(2)
-    score = torch.where(homes == 7, 0.0, 1.0)
-    score[3] = 0
-    played = arrdict(score=score, lengths=score + 5, slots=torch.zeros(40), homes=homes)
-    row = statistics.worst_summary(played)
-    assert (row["won"], row["losses"], row["duels"], row["homes"]) == (0, 2, 2, 1)
-    assert row["length"] == 5 and row["lower"] == 0 < row["upper"]
