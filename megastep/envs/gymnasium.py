@@ -47,9 +47,8 @@ class Gymnasium(VectorizedEnv):
         seed: each environment is reset with a seed of its own, which derives from this one.
         films: renders images from the start, if it can. Some environments make their renderer in
             the constructor, and some step more slowly with it.
-        check: refuses, in the first steps of each environment, observations that are not in their
-            space and results of another form than Gymnasium's, and at any time actions that are
-            not finite. Numbers beyond the bounds of a Box are a warning.
+        check: refuses, in the first steps, observations that are not in their space, and at any
+            time actions that are not finite. Numbers beyond the bounds of a Box are a warning.
         device: where worlds and actions are. Default: a GPU if there is one.
     """
 
@@ -73,8 +72,7 @@ class Gymnasium(VectorizedEnv):
         except ValueError as error:
             raise ValueError(f"env.wrappers: {error}") from None
         with one_sentence(id, kwargs):
-            more = dict(seed=seed, check=check)
-            vector = _hosted(spec, n_envs, kwargs, functions, vectorization, films, more)
+            vector = _hosted(spec, n_envs, kwargs, functions, vectorization, films, seed)
         super().__init__(id, vector, n_envs, 1, seed, device, check)
 
 
@@ -106,7 +104,7 @@ def _spec(id) -> "EnvSpec":
     return gymnasium.registry[name]
 
 
-def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, more) -> Any:
+def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, seed) -> Any:
     """Returns single environments as a vector environment, in this process or in others."""
     from megastep.hosting.hosted import HostedEnvs, make_env
     from megastep.hosting.probe import probe
@@ -122,8 +120,8 @@ def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, more) -> Any:
         example.close()
     make = functools.partial(make_env, spec, wrappers, kwargs)
     if vectorization == "sync":
-        vector = HostedEnvs(make, n_envs, found=probe(make), **more)
+        vector = HostedEnvs(make, n_envs, found=probe(make), seed=seed)
     else:
-        vector = VectorProcesses(make, n_envs, **more)
+        vector = VectorProcesses(make, n_envs, seed)
     vector.max_episode_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
     return vector

@@ -59,5 +59,5 @@ class PettingZoo(VectorizedEnv):
             raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
         make, functions = import_object(id), [import_object(name) for name in wrappers]
         with one_sentence(id, kwargs):
-            vector = ParallelEnvs(make, n_envs, kwargs or {}, check, functions)
+            vector = ParallelEnvs(make, n_envs, kwargs or {}, functions)
         super().__init__(id, vector, n_envs, len(vector.agents), seed, device, check)

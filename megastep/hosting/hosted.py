@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
 from megastep.global_generators import KINDS, GlobalGenerators
-from megastep.hosting.env_error import BadValue, EnvError
+from megastep.hosting.env_error import EnvError
 from megastep.hosting.probe import (
     TRUE_RETURN,
     Probe,
@@ -26,7 +26,7 @@ from megastep.hosting.probe import (
     numbers_of,
     wrapper_state,
 )
-from megastep.hosting.values import CHECKED_STEPS, allowed_actions, masked_actions, problem
+from megastep.hosting.values import allowed_actions, masked_actions
 from megastep.types import Space, Tree
 
 __all__ = ["HostedEnvs", "ParallelEnvs", "make_env"]
@@ -49,7 +49,6 @@ class Hosted:
 
     Args:
         spaces: of one lane's observation and action.
-        check: checks the form of what they return in the first `CHECKED_STEPS`.
         first: number of the first environment in messages.
     """
 
@@ -61,12 +60,10 @@ class Hosted:
         envs: list[Any],
         spaces: tuple[Space, Space],
         found: Probe,
-        check: bool,
         n_agents: int = 1,
         first: int = 0,
     ):
         self.envs, self.found, self.n_agents, self.first = envs, found, n_agents, first
-        self.n_to_check = CHECKED_STEPS if check else 0
         self.metadata, self.render_mode = envs[0].metadata, getattr(envs[0], "render_mode", None)
         self.single_observation_space, self.single_action_space = spaces
         n = len(envs) * n_agents
@@ -104,7 +101,6 @@ class Hosted:
             raise
         except Exception as error:
             raise EnvError.of(error, self._name(e)) from error
-        self.n_to_check = max(0, self.n_to_check - 1)
         obs = concatenate(self.single_observation_space, self.latest, self.batch)
         return obs, self.rewards, self.terminated, self.truncated, self.infos
 
@@ -114,23 +110,16 @@ class Hosted:
     def _step(self, e, chosen) -> None:
         raise NotImplementedError
 
-    def _checked(self, e, method, result, agents=None) -> Any:
-        """Returns what environment e returned. Raises BadValue if its form is wrong."""
-        space = self.single_observation_space
-        if self.n_to_check and (clause := problem(method, result, space, agents)):
-            raise BadValue.of(clause, self._name(e))
-        return result
-
     def _name(self, e) -> str:
         return f"environment {self.first + e}"
 
     def wrapper_state(self) -> Tree:
-        """Returns what the wrappers of the first environment have learnt, by path."""
-        return wrapper_state(self.envs[0], self.found.learnt) if self.found.learnt else {}
+        """Returns the running statistics in the wrappers of the first environment, by path."""
+        return wrapper_state(self.envs[0])
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives the wrappers of all environments what others have learnt, which stays as it is if
-        it `is_frozen`. Raises ValueError if they are not in such wrappers.
+        """Gives the wrappers of all environments the statistics of others, which stay as they are
+        if `is_frozen`. Raises ValueError if they are not in such wrappers.
         """
         self.frozen = state if is_frozen else None
         for env in self.envs:
@@ -181,7 +170,6 @@ class HostedEnvs(Hosted):
         first: int = 0,
         found: Probe | None = None,
         seed: int = 0,
-        check: bool = True,
     ):
         envs, self.generators, found = [], [], found or Probe()
         for number in range(first, first + n_envs):
@@ -191,7 +179,7 @@ class HostedEnvs(Hosted):
             generators.drop({*KINDS} - {*found.generators})  # checkpoints do not hold them
             self.generators.append(generators)
         spaces = envs[0].observation_space, envs[0].action_space
-        super().__init__(envs, spaces, found, check, first=first)
+        super().__init__(envs, spaces, found, first=first)
         self.numbers = self.infos["numbers"] = np.zeros((n_envs, len(found.names)))
 
     def _begin(self, e, settings) -> None:
@@ -202,7 +190,7 @@ class HostedEnvs(Hosted):
 
     def _step(self, e, chosen) -> None:
         found, env = self.found, self.envs[e]
-        is_watched = found.generators or self.frozen or self.n_to_check
+        is_watched = found.generators or self.frozen
         result = self._call(e, "step", *chosen) if is_watched else env.step(*chosen)
         self.latest[e], self.rewards[e], terminated, truncated, info = result
         self.terminated[e], self.truncated[e] = terminated, truncated
@@ -221,7 +209,7 @@ class HostedEnvs(Hosted):
             result = getattr(self.envs[e], method)(*arguments, **settings)
         if self.frozen:
             load_wrapper_state(self.envs[e], self.frozen)
-        return self._checked(e, method, result)
+        return result
 
 
 class ParallelEnvs(Hosted):
@@ -239,7 +227,6 @@ class ParallelEnvs(Hosted):
         make: Callable,
         n_envs: int,
         kwargs: dict[str, Any],
-        check: bool = True,
         wrappers: Sequence[Callable] = (),
     ):
         parameters = inspect.signature(make).parameters
@@ -258,7 +245,7 @@ class ParallelEnvs(Hosted):
         masks = _masks(*first) if isinstance(first, tuple) and len(first) == 2 else {}
         sizes = [masked_actions(spaces[1], one) for one in masks.values()]
         found = Probe(n_masked=min(sizes, default=0))
-        super().__init__(envs, spaces, found, check, len(self.agents))
+        super().__init__(envs, spaces, found, len(self.agents))
         self.render_mode = kwargs.get("render_mode")
         lanes = batch_space(spaces[0], len(self.latest))
         self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]
@@ -279,7 +266,7 @@ class ParallelEnvs(Hosted):
 
     def _begin(self, e, settings) -> None:
         env = self.envs[e]
-        observed, infos = self._checked(e, "reset", env.reset(**settings), self.agents)
+        observed, infos = env.reset(**settings)
         self._observe(e, observed, infos)
         for lane, agent in self._lanes(e):
             self.rewards[lane] = self.terminated[lane] = self.truncated[lane] = 0
@@ -288,9 +275,8 @@ class ParallelEnvs(Hosted):
 
     def _step(self, e, chosen) -> None:
         env, actions = self.envs[e], dict(zip(self.agents, chosen))
-        result = env.step({agent: actions[agent] for agent in env.agents})
-        observed, rewards, terminated, truncated, infos = self._checked(
-            e, "step", result, self.agents
+        observed, rewards, terminated, truncated, infos = env.step(
+            {agent: actions[agent] for agent in env.agents}
         )
         self._observe(e, observed, infos)
         self.ended[e] = True

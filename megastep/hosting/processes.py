@@ -35,7 +35,7 @@ class VectorProcesses:
 
     max_episode_steps: int | None = None
 
-    def __init__(self, make: Callable, n_envs: int, seed: int = 0, check: bool = True):
+    def __init__(self, make: Callable, n_envs: int, seed: int = 0):
         import loky
         from loky.backend import get_context
 
@@ -51,7 +51,7 @@ class VectorProcesses:
                 pipe, far_end = multiprocessing.Pipe()
                 process = context.Process(  # pyright: ignore[reportAttributeAccessIssue]
                     target=_serve,
-                    args=(far_end, make, rows, seed, check),
+                    args=(far_end, make, rows, seed),
                     daemon=True,
                     env=workers.WORKER_ENV,
                 )
@@ -141,7 +141,7 @@ class VectorProcesses:
         )
 
 
-def _serve(pipe, make, rows, seed, check) -> None:
+def _serve(pipe, make, rows, seed) -> None:
     """Answers commands until the pipe is closed, which it is when the other process ends."""
     global_seed = int(np.random.SeedSequence([seed, rows.start]).generate_state(1)[0])
     np.random.seed(global_seed)  # for what draws too rarely to be found by a probe
@@ -154,7 +154,7 @@ def _serve(pipe, make, rows, seed, check) -> None:
             return probe(make)
         if command == "begin":
             n_envs = rows.stop - rows.start
-            envs = HostedEnvs(make, n_envs, rows.start, seed=seed, check=check, **arguments)
+            envs = HostedEnvs(make, n_envs, rows.start, seed=seed, **arguments)
             names = "metadata", "render_mode", "single_observation_space", "single_action_space"
             return [getattr(envs, name) for name in names]
         return getattr(envs, command)(**arguments)

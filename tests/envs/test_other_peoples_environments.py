@@ -18,7 +18,7 @@ from megastep.envs import Gymnasium  # noqa: E402
 from megastep.hosting.env_error import BadValue, EnvError  # noqa: E402
 from megastep.hosting.hosted import HostedEnvs  # noqa: E402
 from megastep.hosting.probe import probe  # noqa: E402
-from megastep.hosting.values import beyond_bounds, problem  # noqa: E402
+from megastep.hosting.values import beyond_bounds  # noqa: E402
 from megastep.hosting.vectorized import as_frame  # noqa: E402
 from tests.helpers import odd_envs  # noqa: E402
 
@@ -139,56 +139,22 @@ class Wrong(odd_envs.Odd):
 
     def reset(self, seed=None, options=None):
         obs, info = super().reset(seed=seed)
-        return {"reset with one": obs, "reset info": (obs, None)}.get(self.what, (obs, info))
+        return obs if self.what == "reset with one" else (obs, info)
 
     def step(self, action):
         obs, reward, terminated, truncated, info = super().step(action)
-        return {
-            "four": (obs, reward, terminated, info),
-            "shape": (np.zeros((2, 1), np.float32), reward, terminated, truncated, info),
-            "info": (obs, reward, terminated, truncated, None),
-            "reward": (obs, None, terminated, truncated, info),
-            "flag": (obs, reward, None, truncated, info),
-        }.get(self.what, (obs, reward, terminated, truncated, info))
+        rest = (info,) if self.what == "four" else (truncated, info)
+        return obs, reward, terminated, *rest
 
 
-@pytest.mark.parametrize(
-    "what, problem",
-    [
-        ("reset with one", "reset() must return (observation, info), and returned"),
-        ("reset info", "reset() must return a dict as info, and returned None"),
-        ("four", "step() must return (observation, reward, terminated, truncated, info), and ret"),
-        ("shape", "step() returned an observation that is not in its space, Box(0.0, 1e+06, (1,)"),
-        ("info", "step() must return a dict as info, and returned None"),
-        ("reward", "step() must return a number as reward, and returned None"),
-        ("flag", "step() must return a bool as terminated, and returned None"),
-    ],
-)
-def test_wrong_results_are_named(what, problem):
+@pytest.mark.parametrize("what", ["reset with one", "four"])
+def test_wrong_results_are_named(what):
     envs = HostedEnvs(lambda: Wrong(what), 2)
-    with pytest.raises(BadValue, match=f"^environment 0: {re.escape(problem)}") as error:
+    text = "^environment 0 failed: ValueError: not enough values to unpack"
+    with pytest.raises(EnvError, match=text) as error:
         envs.reset(seed=[1, 2])
         envs.step(np.zeros(2, int))
-    assert str(error.value).endswith("To leave it as it is, use env.check=false")
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "space, value, is_wrong",
-    [
-        (spaces.Discrete(4), np.int64(3), False),
-        (spaces.Discrete(4), 1.5, True),
-        (spaces.Box(0, 1, (3,)), np.zeros(1), True),
-        (spaces.Box(0, 1, (2,)), [[1], [1, 2]], True),
-        (spaces.Box(0, 1, (3,)), np.full(3, 5.0), False),  # beyond its bounds, in float64
-        (spaces.Dict(a=spaces.Discrete(2)), {"b": 1}, True),
-        (spaces.Tuple([spaces.Discrete(2)] * 2), (1,), True),
-    ],
-)
-def test_observations_of_another_form_than_their_space(space, value, is_wrong):
-    found = problem("reset", (value, {}), space)
-    assert (found is not None) == is_wrong
-    assert not found or found.startswith("reset() returned an observation that is not in its space")
 
 
 @pytest.mark.parametrize(

@@ -32,14 +32,13 @@ def played(env, n_steps=25):
 
 @pytest.mark.parametrize("vectorization", ["sync", "async"])
 def test_what_a_wrapper_keeps_beyond_an_episode_is_carried_and_frozen(vectorization):
-    """Numbers, arrays and lists, also in objects and dicts, but not its count of steps."""
+    """Running statistics, but not its count of steps."""
     env = make("Level")
     contract.rollout(env, 35)  # 11 steps each
     state = env.wrapper_state()
-    prefix = "0.Level."
-    assert state[f"{prefix}memory.level"] == 3 and state[f"{prefix}returns"] == 3 * [1.5]
-    assert state[f"{prefix}memory.table.sizes"].tolist() == [3, 3]
-    assert set(state) == {f"{prefix}{n}" for n in ("memory.level", "memory.table.sizes", "returns")}
+    prefix = "0.Level.memory."
+    assert state[f"{prefix}count"] == 3 and state[f"{prefix}var"].tolist() == [3, 3]
+    assert set(state) == {f"{prefix}{name}" for name in ("mean", "var", "count")}
     other = make("Level", vectorization=vectorization)
     other.load_wrapper_state(state, is_frozen=True)
     worlds = contract.rollout(other, 35)
@@ -47,7 +46,7 @@ def test_what_a_wrapper_keeps_beyond_an_episode_is_carried_and_frozen(vectorizat
     assert str(other.wrapper_state()) == str(state)
     other.load_wrapper_state(state, is_frozen=False)
     contract.rollout(other, 35)
-    assert other.wrapper_state()[f"{prefix}memory.level"] == 6
+    assert other.wrapper_state()[f"{prefix}count"] == 6
     other.close()
 
 
