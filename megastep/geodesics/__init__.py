@@ -229,7 +229,6 @@ class PathGraph:
             widths=self.tensor(self.shapes[:, 1], np.int32),
             point_starts=self.tensor(_starts(counts), np.int32),
             lengths=lengths,
-            hints=torch.empty(len(self.corner_homes), dtype=torch.int32, device=self.device),
             cell=CELL,
             n_points=n_points,
             n_goals=n_goals,

@@ -54,7 +54,6 @@ struct PathLengthsParams {
     const int* widths;        // (D) columns of each home's grid, or 1
     const int* point_starts;  // (D + 1) first point of each home
     float* lengths;           // out: per home (G, points of the home): metres to each goal
-    int* hints;               // (V) scratch on the CPU
     float cell;               // metres between neighbouring cells
     int n_points;             // P
     int n_goals;              // G

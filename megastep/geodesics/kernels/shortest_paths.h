@@ -115,11 +115,12 @@ HD Line line_between(Point p, Point q, float least2) {
     return {p, dx, dy, length2 > 0.f ? 1.f / length2 : 0.f, least2};
 }
 
-// Returns 1 if the wall ab crosses the line or comes too near to it. The ends of the line are not
+// Returns 1 if wall i crosses the line or comes too near to it. The ends of the line are not
 // tested: they are clear already.
-HD int wall_blocks(float ax, float ay, float bx, float by, const Line& line) {
+HD int blocks(const HomeWalls& walls, int i, const Line& line) {
     float dx = line.dx, dy = line.dy;
-    float rx = ax - line.p.x, ry = ay - line.p.y, sx = bx - line.p.x, sy = by - line.p.y;
+    float rx = walls.ax[i] - line.p.x, ry = walls.ay[i] - line.p.y;
+    float sx = walls.bx[i] - line.p.x, sy = walls.by[i] - line.p.y;
     float t = clamp((rx * dx + ry * dy) * line.inverse, 0.f, 1.f);
     float u = clamp((sx * dx + sy * dy) * line.inverse, 0.f, 1.f);
     float ex = rx - t * dx, ey = ry - t * dy, fx = sx - u * dx, fy = sy - u * dy;
@@ -130,10 +131,6 @@ HD int wall_blocks(float ax, float ay, float bx, float by, const Line& line) {
            ((side_a * side_b < 0.f) & (near_side * far_side < 0.f));
 }
 
-HD int blocks(const HomeWalls& walls, int i, const Line& line) {
-    return wall_blocks(walls.ax[i], walls.ay[i], walls.bx[i], walls.by[i], line);
-}
-
 HD int group_blocks(const HomeWalls& walls, int group, const Line& line) {
     int blocked = 0;
     for (int i = GROUP * group; i < GROUP * group + GROUP; i++)
@@ -141,22 +138,11 @@ HD int group_blocks(const HomeWalls& walls, int group, const Line& line) {
     return blocked;
 }
 
-// Returns 1 if a wall of the group blocks the line. If `hint` is given, the wall is stored there.
-HD int group_blocks(const HomeWalls& walls, int group, const Line& line, int* hint) {
-    int blocked = group_blocks(walls, group, line);
-    for (int i = GROUP * group; hint && blocked && i < GROUP * group + GROUP; i++)
-        *hint = blocks(walls, i, line) ? i : *hint;
-    return blocked;
-}
-
-// Returns 1 if the straight line between two points keeps sqrt(least2) metres from all walls. If
-// `hint` is given, it holds the wall that blocked a similar line, which is tried first.
-HD int is_clear(const HomeWalls& walls, Point p, Point q, float least2, int* hint) {
+// Returns 1 if the straight line between two points keeps sqrt(least2) metres from all walls.
+HD int is_clear(const HomeWalls& walls, Point p, Point q, float least2) {
     Line line = line_between(p, q, least2);
-    if (hint && *hint >= 0 && blocks(walls, *hint, line))
-        return 0;
     return !any_group(walls, bounds_of(p, q, SQRT(least2)),
-                      [&](int k) { return group_blocks(walls, k, line, hint); });
+                      [&](int k) { return group_blocks(walls, k, line); });
 }
 
 // ---- Corners ----
@@ -204,7 +190,7 @@ HD void each_link(const HomesParams& p, int home, int corner, Found found) {
         Point there = corner_at(corners, other);
         if (is_tangent(corners, other, here) && other != corner &&
             is_tangent(corners, corner, there) &&
-            is_clear(walls, here, there, p.clearance * p.clearance, nullptr))
+            is_clear(walls, here, there, p.clearance * p.clearance))
             found(other);
     }
 }
@@ -241,8 +227,7 @@ HD float straight_to_goal(const CornerDistancesParams& p, int home, int corner, 
     Point start = corner_at(corners, corner);
     Point end = point_at(p.goals, (long long)home * p.n_goals + goal);
     float least2 = p.homes.clearance * p.homes.clearance;
-    if (!is_tangent(corners, corner, end) ||
-        !is_clear(walls_of(p.homes, home), start, end, least2, nullptr))
+    if (!is_tangent(corners, corner, end) || !is_clear(walls_of(p.homes, home), start, end, least2))
         return INF_VALUE;
     return maxf(distance_between(start, end) - p.homes.rebate, 0.f);
 }
@@ -294,11 +279,7 @@ HD int reachable_point(const HomesParams& p, const HomeWalls& walls, Point& q) {
         q.y += step * y;
         nearest = squared_clearance(walls, q, least2, group);
     }
-    return nearest >= least2 && is_clear(walls, from, q, 0.f, nullptr);
-}
-
-HD Point goal_at(const PathLengthsParams& p, int home, int goal) {
-    return point_at(p.goals, (long long)home * p.n_goals + goal);
+    return nearest >= least2 && is_clear(walls, from, q, 0.f);
 }
 
 // The shortest paths from a point to the goals of its home, as far as they are known.
@@ -309,28 +290,10 @@ struct Paths {
     int corner[MAX_GOALS];      // the first corner, -1: straight to the goal
 };
 
-HD void clear_paths(Paths& paths) {
-    for (int goal = 0; goal < MAX_GOALS; goal++) {
-        paths.shortest[goal] = paths.length[goal] = INF_VALUE;
-        paths.corner[goal] = -1;
-    }
-}
-
-// Goes from the point to a goal in a straight line, if clear(from, to) says that it is possible.
-template <class Clear>
-HD void try_straight(const PathLengthsParams& p, int home, int goal, Paths& paths, Clear clear) {
-    Point end = goal_at(p, home, goal);
-    if (clear(paths.from, end)) {
-        paths.shortest[goal] = distance_between(paths.from, end);
-        paths.length[goal] = distance_between(paths.at, end);
-    }
-}
-
 // Goes from the point to all goals by way of a corner to which its line is a tangent, where that is
 // shorter. Of equal paths, the one by the corner with the lower number is kept, so that the outcome
-// does not depend on the order of trials. clear is as above.
-template <class Clear>
-HD void try_corner(const PathLengthsParams& p, int corner, Paths& paths, Clear clear) {
+// does not depend on the order of trials.
+HD void try_corner(const PathLengthsParams& p, const HomeWalls& walls, int corner, Paths& paths) {
     Point bend = corner_at(corners_of(p.homes), corner);
     const float* distances = p.distances + (long long)MAX_GOALS * corner;
     float straight = distance_between(paths.from, bend);
@@ -341,7 +304,7 @@ HD void try_corner(const PathLengthsParams& p, int corner, Paths& paths, Clear c
         improves |= (metres < paths.shortest[goal]) |
                     ((metres == paths.shortest[goal]) & (corner < paths.corner[goal]));
     }
-    if (!improves || !clear(paths.from, bend))
+    if (!improves || !is_clear(walls, paths.from, bend, p.homes.clearance * p.homes.clearance))
         return;
     float extrapolated = distance_between(paths.at, bend);
 #pragma omp simd
@@ -355,13 +318,34 @@ HD void try_corner(const PathLengthsParams& p, int corner, Paths& paths, Clear c
     }
 }
 
-// Writes lengths to the goals, infinite if `fits` is 0.
-HD void write_lengths(const PathLengthsParams& p, int home, int i, const Paths& paths, int fits) {
+// Writes the lengths of the shortest paths from point i to the goals of its home.
+HD void point_lengths(const PathLengthsParams& p, int i) {
+    int home = home_of(p, i), end = p.homes.corner_starts[home + 1];
+    HomeWalls walls = walls_of(p.homes, home);
+    Corners corners = corners_of(p.homes);
+    float least2 = p.homes.clearance * p.homes.clearance;
+    Paths paths;
+    paths.at = paths.from = nth_point(p, home, i);
+    int fits = reachable_point(p.homes, walls, paths.from);
+    for (int goal = 0; goal < MAX_GOALS; goal++) {
+        paths.shortest[goal] = paths.length[goal] = INF_VALUE;
+        paths.corner[goal] = -1;
+        if (!fits || goal >= p.n_goals)
+            continue;
+        Point at = point_at(p.goals, (long long)home * p.n_goals + goal);
+        if (is_clear(walls, paths.from, at, least2)) {
+            paths.shortest[goal] = distance_between(paths.from, at);
+            paths.length[goal] = distance_between(paths.at, at);
+        }
+    }
+    for (int corner = p.homes.corner_starts[home]; fits && corner < end; corner++)
+        if (is_tangent(corners, corner, paths.from))
+            try_corner(p, walls, corner, paths);
     int first = p.point_starts[home], n_points = p.point_starts[home + 1] - first;
     float* lengths = p.lengths + (long long)first * p.n_goals + (i - first);
     for (int goal = 0; goal < MAX_GOALS; goal++)
         if (goal < p.n_goals)
-            lengths[(long long)goal * n_points] = fits ? paths.length[goal] : INF_VALUE;
+            lengths[(long long)goal * n_points] = paths.length[goal];
 }
 
 // Metres from point i to the nearest wall, at most `most`.
