@@ -124,7 +124,7 @@ def test_categories_are_one_hot_whatever_was_seen_before():
     intake = heads.intake(space, WIDTH, "categories")
     obs = arrdict(image=image, direction=torch.tensor([[2]]))
     update(intake, obs)
-    rows = intake.encode(obs)[0, :63].view(3, 21)
+    rows = intake.encode(obs)[0, :63].view(21, 3).T
     assert [row.nonzero().flatten().tolist() for row in rows] == [
         [4, 11 + 5, 17 + 2],
         [10, 11, 17 + 3],
