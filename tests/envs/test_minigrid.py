@@ -2,11 +2,8 @@
 end.
 """
 
-import functools
 import re
-import warnings
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -16,11 +13,9 @@ from megastep import envs
 from megastep.agents.cli import train
 from megastep.arrdict import arrdict
 from megastep.envs.minigrid.tasks import TASKS
+from tests.helpers.minigrids import mission_of, original
 from tests.helpers.pages import ROOT
 from tests.helpers.pong_twins import philox
-
-KINDS = "key", "ball", "box"
-COLOURS = "red", "green", "blue", "purple", "yellow", "grey"
 
 
 class OurDraws:
@@ -43,25 +38,6 @@ class OurDraws:
             items[i], items[j] = items[j], items[i]
 
 
-@functools.cache
-def original(id):
-    pytest.importorskip("minigrid", minversion="3.2", reason="needs minigrid of Python 3.11")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that a newer version of a task is there
-        return gymnasium.make(id, disable_env_checker=True).unwrapped
-
-
-def mission_of(text):
-    """Returns the one-hot mission (18,) of a text."""
-    words, row = text.split(), np.zeros(18)
-    places = [i for i, word in enumerate(words) if word in COLOURS]
-    for part, place in enumerate(places):
-        row[9 * part + COLOURS.index(words[place])] = 1
-        if words[place + 1] in KINDS:
-            row[9 * part + 6 + KINDS.index(words[place + 1])] = 1
-    return row
-
-
 def assert_equal(world, e, obs, reward, terminated, truncated):
     ours = world.obs.image[e, 0].permute(2, 1, 0).numpy()  # x, y, channel
     assert np.array_equal(ours, obs["image"])
@@ -75,9 +51,10 @@ def assert_equal(world, e, obs, reward, terminated, truncated):
     )
 
 
-def play(id, n_envs, n_episodes, seed=3):
+def play(id, n_envs, n_episodes, seed=3, rooms=None):
     """Compares episodes of random actions, often forward."""
-    ours, theirs = envs.MiniGrid(n_envs, id=id, seed=seed, device="cpu"), original(id)
+    ours = envs.MiniGrid(n_envs, id=id, rooms=rooms, seed=seed, device="cpu")
+    theirs = original(id, rooms)
     n_actions = ours.task.n_actions
     weights = torch.ones(n_actions)
     weights[2] = 3
@@ -109,6 +86,10 @@ def play(id, n_envs, n_episodes, seed=3):
 @pytest.mark.parametrize("id", TASKS)
 def test_equals_the_original(id):
     play(id, n_envs=1, n_episodes=1)
+
+
+def test_rooms_equal_the_originals():
+    play("MiniGrid-MultiRoom-N6-v0", n_envs=4, n_episodes=2, rooms=(1, 3))
 
 
 @pytest.mark.nightly
@@ -165,6 +146,8 @@ def test_grids_of_a_users_function(device):
     [
         (dict(id="MiniGrid-DoorKey-9x9-v0"), "near are MiniGrid-DoorKey-"),
         (dict(layouts=f"{__name__}:broken_rooms"), "grid 1 has a cell that is no kind"),
+        (dict(rooms=(1, 2)), "fewest and the most rooms of a MultiRoom task"),
+        (dict(id="MiniGrid-MultiRoom-N6-v0", rooms=(3, 2)), "fewest and the most rooms"),
     ],
 )
 def test_bad_settings(settings, words):

@@ -26,6 +26,7 @@ __all__ = ["MiniGrid"]
 
 VIEW, N_MISSION = LIBRARY.constants["VIEW"], LIBRARY.constants["N_MISSION"]
 GAME_FIELDS = LIBRARY.constants["GAME_FIELDS"]
+Rooms = Annotated[int, Field(ge=1, le=LIBRARY.constants["MAX_ROOMS"])]
 MAX_SIZE = 128  # cells along a side of a custom grid
 N_DRAWS, ENDED = 5, 6  # rows of a game's state
 
@@ -57,6 +58,8 @@ class MiniGrid(DisplayedEnv):
     Args:
         n_envs: number of environments.
         id: task, by its id in Gymnasium's registry.
+        rooms: fewest and most rooms of MultiRoom, which each episode draws from; the limit is 20
+            steps for each of the most. None: as the id says.
         layouts: import path of a function that draws grids in place of a task's; see docs/grids.md.
         limit: steps of an episode in such grids.
         seed: of the layouts and of what moves.
@@ -73,6 +76,7 @@ class MiniGrid(DisplayedEnv):
         n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
         *,
         id: str = "MiniGrid-DoorKey-8x8-v0",
+        rooms: tuple[Rooms, Rooms] | None = None,
         layouts: str | None = None,
         limit: Annotated[int, Field(ge=1, le=10**6)] = 1000,
         seed: int = 1,
@@ -82,7 +86,7 @@ class MiniGrid(DisplayedEnv):
         self.device = engine.device("auto" if device is None else device)
         self.layouts = self.starts = None
         if layouts is None:
-            self.task = task_of(id)
+            self.task = task_of(id) if rooms is None else with_rooms(task_of(id), *rooms)
         else:
             cells, starts = custom(import_object(layouts), seed)
             self.layouts, self.starts = cells.to(self.device), starts.to(self.device)
@@ -172,6 +176,15 @@ def task_of(id: str) -> Task:
             f"id: {id!r} is not among MiniGrid's tasks here; near are {', '.join(near)}"
         )
     return TASKS[id]
+
+
+def with_rooms(task: Task, fewest: int, most: int) -> Task:
+    """Returns a task of MultiRoom with so many rooms. ValueError if it is another task."""
+    if task.task != LIBRARY.constants["MULTI_ROOM"] or fewest > most:
+        raise ValueError(
+            f"rooms: {[fewest, most]} must be the fewest and the most rooms of a MultiRoom task"
+        )
+    return task._replace(a=fewest, b=most, limit=20 * most)
 
 
 def custom(

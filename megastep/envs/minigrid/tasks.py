@@ -14,7 +14,7 @@ WITH_MISSIONS = "UNLOCK_PICKUP", "KEY_CORRIDOR", "PUT_NEAR", "GO_TO_DOOR"
 
 
 class Task(NamedTuple):
-    """A task: what the kernel needs to know of it. ``a`` and ``b`` are described in layouts.h."""
+    """A task: what the kernel needs to know of it. ``a`` to ``c`` are described in layouts.h."""
 
     task: int
     width: int
@@ -22,6 +22,7 @@ class Task(NamedTuple):
     limit: int
     a: int = 0
     b: int = 0
+    c: int = 0
     n_actions: int = 7
     sees_through: int = 0
 
@@ -63,7 +64,8 @@ def _tasks() -> dict[str, Task]:
         ("N4-S5-v1", 4, 5),
         ("N6-v0", 6, 10),
     ):
-        add(f"MultiRoom-{name}", "MULTI_ROOM", 25, 20 * n_rooms, a=n_rooms, b=size)
+        rooms: dict = dict(a=n_rooms, b=n_rooms, c=size)
+        add(f"MultiRoom-{name}", "MULTI_ROOM", 25, 20 * n_rooms, **rooms)
     for size in 5, 6, 7:
         add(f"LavaGapS{size}-v0", "LAVA_GAP", size, 4 * size**2)
     for kind, cell in ("Lava", _C["LAVA"] + 16 * RED), ("Simple", _C["WALL"] + 16 * GREY):

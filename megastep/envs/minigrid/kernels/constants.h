@@ -4,6 +4,7 @@
 constexpr int VIEW = 7;          // cells along a side of the agent's view
 constexpr int GAME_FIELDS = 19;  // of struct Game
 constexpr int MAX_OBSTACLES = 8;
+constexpr int MAX_ROOMS = 9;
 constexpr int N_MISSION = 18;  // numbers of a mission: colour, kind; colour, kind
 
 // What a cell holds is a kind, plus 16 times a colour. The first nine have the numbers of the

@@ -25,6 +25,7 @@ struct MiniGridStepParams : OutcomeParams {
     int task;          // see constants.h
     int a;             // of the task: see layouts.h; D
     int b;             // of the task
+    int c;             // of the task
     int n_actions;     // those above are errors
     int sees_through;  // whether the agent sees through walls
     int n_threads;     // CPU threads
@@ -55,7 +56,7 @@ static_assert(sizeof(Game) == GAME_FIELDS * sizeof(int), "GAME_FIELDS");
 // the parameters, which a GPU would copy first.
 struct Grid {
     unsigned char* cells;  // (H, W)
-    int width, height, env, task, a, b, sees_through;
+    int width, height, env, task, a, b, c, sees_through;
     int first_draw;  // of this step
     unsigned int key0, key1;
     const unsigned char* layouts;
@@ -65,7 +66,7 @@ struct Grid {
 
 HD Grid grid_of(const MiniGridStepParams& p, const Game& g, int env) {
     unsigned char* cells = p.cells + (long long)env * p.width * p.height;
-    return {cells,          p.width,   p.height, env,    p.task,    p.a,      p.b,
+    return {cells,          p.width,   p.height, env,    p.task,    p.a,      p.b,         p.c,
             p.sees_through, g.n_draws, p.key0,   p.key1, p.layouts, p.starts, p.error_flag};
 }
 

@@ -84,7 +84,6 @@ RARE void door_key(Game& g, const Grid& grid) {
 // ---- Rooms in rows, of which neighbours share walls ----
 
 constexpr int TO_RIGHT = 0, DOWN = 1, TO_LEFT = 2, UP = 3;
-constexpr int MAX_ROOMS = 9;
 constexpr int OFFSET_BITS = 3;
 constexpr int FIRST_WALLS = 0x15555;  // the wall to the right of each room
 
@@ -223,7 +222,7 @@ struct ChainedRoom {
 // Draws a room behind a door in one of its walls. Returns 0 if it does not fit.
 HD int chain_room(Game& g, const Grid& grid, ChainedRoom* rooms, int n, int wall_of_door, int x,
                   int y) {
-    int w = draw(g, grid, 4, grid.b + 1), h = draw(g, grid, 4, grid.b + 1);
+    int w = draw(g, grid, 4, grid.c + 1), h = draw(g, grid, 4, grid.c + 1);
     int left = x, top = y;
     if (n > 0) {
         int is_beside = wall_of_door == TO_RIGHT || wall_of_door == TO_LEFT;
@@ -271,10 +270,10 @@ HD int chain_rooms(Game& g, const Grid& grid, ChainedRoom* rooms, int n_rooms) {
     return n;
 }
 
-// a: rooms, b: the largest size of a room.
+// a: fewest rooms, b: most, c: the largest size of a room.
 RARE void multi_room(Game& g, const Grid& grid) {
     ChainedRoom rooms[MAX_ROOMS];
-    int n_rooms = draw(g, grid, grid.a, grid.a + 1), colour = -1;
+    int n_rooms = draw(g, grid, grid.a, grid.b + 1), colour = -1;
     int n_chained = 0;
     while (n_chained < n_rooms && may_draw(g, grid))
         n_chained = chain_rooms(g, grid, rooms, n_rooms);
