@@ -38,7 +38,7 @@ def test_packed_structs_have_the_compilers_layout(library, tmp_path):
     packed, code = {}, '#include "common/objects.h"\n#include "common/step.h"\n'
     code += "".join(f'#include "{name}"\n' for name in declaring)
     for name, layout in library.structs.items():
-        fields = dict(kernel_library._fields(layout))
+        fields = dict(layout._all_fields_)
         values: dict = {field: position + 1 for position, field in enumerate(fields)}
         whole = {f: bytes(ctypes.sizeof(kind)) for f, kind in fields.items() if not is_number(kind)}
         packed[name] = getattr(library.params, name)(**values | whole)

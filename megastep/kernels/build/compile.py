@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from megastep import cache
-from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary, operations
+from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary, kernels
 
 if TYPE_CHECKING:
     from ctypes import CDLL
@@ -294,7 +294,7 @@ def joined(files: dict[str, str]) -> str:
     included = (
         name
         for name, text in files.items()
-        if name.endswith(".cu") or name.endswith(".h") and operations({name: text})
+        if name.endswith(".cu") or name.endswith(".h") and kernels({name: text})
     )
     return "".join(f'#include "{name}"\n' for name in included)
 

@@ -13,7 +13,7 @@ import ctypes
 import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -49,6 +49,7 @@ OPERATION = re.compile(
     r"(?:\s*&?\s*\w+\)\s*\{\s*(wait_for_previous\(\)\s*;)?)?",
     re.M,
 )
+COMMENT = re.compile(r"//.*|/\*[\s\S]*?\*/")
 TYPES: dict[str, Any] = {"int": ctypes.c_int, "float": ctypes.c_float}
 TYPES["unsigned int"] = ctypes.c_uint
 #: The source of a function of {field: value} that packs a struct.
@@ -131,22 +132,23 @@ class KernelLibrary:
 
     @cached_property
     def params(self) -> SimpleNamespace:
-        packed = {name: partial(_pack, packer) for name, packer in self.packers.items()}
-        return SimpleNamespace(**packed)
+        packers = self.packers.items()
+        keywords = {name: lambda pack=pack, /, **fields: pack(fields) for name, pack in packers}
+        return SimpleNamespace(**keywords)
 
     @cached_property
     def cpu_operations(self) -> dict[str, str]:
-        return operations(self.sources(".h", ".cpp"))
+        return {one[2]: one[3] for one in kernels(self.sources(".h", ".cpp"))}
 
     @cached_property
     def cuda_operations(self) -> dict[str, str]:
-        return operations(self.sources(".h", ".cu"))
+        return {one[2]: one[3] for one in kernels(self.sources(".h", ".cu"))}
 
     @cached_property
     def early_operations(self) -> frozenset[str]:
-        kernels = [*_kernels(self.sources(".h", ".cu"))]
-        late = {kernel[2] for kernel in kernels if not kernel[1] and not kernel[4]}
-        return frozenset(kernel[2] for kernel in kernels) - late
+        found = kernels(self.sources(".h", ".cu"))
+        late = {one[2] for one in found if not one[1] and not one[4]}
+        return frozenset(one[2] for one in found) - late
 
     def sources(self, *suffixes: str) -> dict[str, str]:
         """Returns the text of the files with these suffixes, by the name that includes them.
@@ -158,18 +160,9 @@ class KernelLibrary:
         return {name: path.read_text() for name, path in files.items() if path.suffix in suffixes}
 
 
-def _pack(packer, /, **fields) -> bytes:
-    return packer(fields)
-
-
-def operations(sources: Mapping[str, str]) -> dict[str, str]:
-    """Returns {operation: name of its struct} of what these sources {name: text} define."""
-    return {kernel[2]: kernel[3] for kernel in _kernels(sources)}
-
-
-def _kernels(sources) -> Iterator[re.Match[str]]:
-    for text in sources.values():
-        yield from OPERATION.finditer(_without_comments(text))
+def kernels(sources: Mapping[str, str]) -> list[re.Match[str]]:
+    """Returns matches of `OPERATION` in sources {name: text}: [2] is the name, [3] the struct."""
+    return [one for text in sources.values() for one in OPERATION.finditer(COMMENT.sub("", text))]
 
 
 def structs(sources: Mapping[str, str]) -> dict[str, type[ctypes.Structure]]:
@@ -178,33 +171,27 @@ def structs(sources: Mapping[str, str]) -> dict[str, type[ctypes.Structure]]:
     """
     found: dict[str, Any] = {}
     for header, text in sources.items():
-        for name, base, body in STRUCT.findall(_without_comments(text)):
-            fields = [_field(line, header, found) for line in body.split(";")[:-1]]
-            parent = found[base] if base else ctypes.Structure
-            found[name] = type(name, (parent,), {"_fields_": fields})
+        for name, base, body in STRUCT.findall(COMMENT.sub("", text)):
+            parent: Any = found[base] if base else ctypes.Structure
+            own: list[tuple[str, Any]] = []
+            for line in body.split(";")[:-1]:
+                match = FIELD.fullmatch(line.strip())
+                kind = ctypes.c_void_p if match and match[2] else None
+                kind = kind or match and (TYPES.get(match[1]) or found.get(match[1]))
+                if not match or not kind or match[4] and match[1] not in found:
+                    raise ValueError(
+                        f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a "
+                        "pointer, an int, an unsigned int, a float, or a struct ...Params declared "
+                        "above or an array of them."
+                    )
+                own.append((match[3], kind * int(match[4]) if match[4] else kind))
+            fields = [*getattr(parent, "_all_fields_", ()), *own]  # with those that it begins with
+            found[name] = type(name, (parent,), {"_fields_": own, "_all_fields_": fields})
     return found
 
 
-def _field(line, header, known) -> tuple[str, Any]:
-    match = FIELD.fullmatch(line.strip())
-    of_name = ctypes.c_void_p if match and match[2] else None
-    of_name = of_name or match and (TYPES.get(match[1]) or known.get(match[1]))
-    if not match or not of_name or match[4] and match[1] not in known:
-        raise ValueError(
-            f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a pointer, "
-            f"an int, an unsigned int, a float, or a struct ...Params declared above or an array "
-            f"of them."
-        )
-    return match[3], of_name * int(match[4]) if match[4] else of_name
-
-
-def _fields(layout) -> list[tuple[str, Any]]:
-    """Returns [(name, type)] of a struct's fields, those that it begins with first."""
-    return [field for part in layout.__mro__[::-1] for field in vars(part).get("_fields_", ())]
-
-
 def _words(layout, title="", start=0) -> Iterator[Word]:
-    for name, kind in _fields(layout):
+    for name, kind in layout._all_fields_:
         at = start + getattr(layout, name).offset
         if issubclass(kind, ctypes.Array):
             one: Any = kind._type_
@@ -216,14 +203,14 @@ def _words(layout, title="", start=0) -> Iterator[Word]:
             yield Word(title + name, kind._type_, at)
 
 
-def packer(layout: type[ctypes.Structure]) -> Callable[[Mapping[str, object]], bytes]:
+def packer(layout: Any) -> Callable[[Mapping[str, object]], bytes]:
     """Returns a function of {field: value} that packs a struct, or raises a TypeError unless it
     gets each field, and no other. A pointer is a tensor, an address, or None for null. An array is
     the joined bytes of its structs; those that are missing at its end are zeros.
     """
     address = "x if (x := values[{!r}]).__class__ is int else 0 if x is None else x.data_ptr()"
     items, kinds, end = [], "", 0
-    for name, kind in _fields(layout):
+    for name, kind in layout._all_fields_:
         at, size = getattr(layout, name).offset, ctypes.sizeof(kind)
         character = (
             f"{size}s" if issubclass(kind, (ctypes.Array, ctypes.Structure)) else kind._type_
@@ -232,11 +219,7 @@ def packer(layout: type[ctypes.Structure]) -> Callable[[Mapping[str, object]], b
         kinds += f"{at - end}x{character}"
         end = at + size
     pack = struct.Struct(f"{kinds}{ctypes.sizeof(layout) - end}x").pack
-    names = dict(_fields(layout)).keys()
+    names = dict(layout._all_fields_).keys()
     scope: dict = dict(name=layout.__name__, names=names, pack=pack)
     exec(PACKED.format(", ".join(items)), scope)  # a loop over the fields would slow launches down
     return scope["packed"]
-
-
-def _without_comments(text) -> str:
-    return re.sub(r"//.*|/\*[\s\S]*?\*/", "", text)
