@@ -52,7 +52,7 @@ ADDED = {
 REPORTERS = {
     "Progress": "megastep.agents.training.trainer:Trainer.report",
     "Speed": "megastep.agents.training.performance:Timing.on_report",
-    "Evaluations in training": "megastep.agents.training.callbacks:Evaluations.on_measure",
+    "Evaluations in training": "megastep.agents.evaluation.in_training:Evaluations.on_measure",
     "Episodes": "megastep.agents.training.episode_stats:EpisodeStats.pop",
     "Self-play": "megastep.agents.selfplay.opponents:Opponents.pop_win_rates",
     "Curricula": "megastep.agents.training.curriculum:SFL.stats",

@@ -1,6 +1,6 @@
 """Evaluations of a policy while it trains."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -11,17 +11,20 @@ from megastep.agents.evaluation import playing
 from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
+from megastep.agents.training.budget import reaches
 from megastep.env_state import way_back
 from megastep.settings import closest
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.distributed.ranks import Ranks
+    from megastep.agents.training.trainer import Trainer
 
 
-class Evaluator:
-    """Measures a policy in episodes of environments of its own, in unseen homes. Each call plays
-    the same episodes, where the environment can be set back, and changes nothing of the training.
+class Evaluations:
+    """A callback that evaluates the policy for some reports, in unseen homes. A checkpoint follows,
+    whose score is the return. Each time plays the same episodes, where the environment can be set
+    back, and neither changes anything of the training nor counts as its time.
 
     Args:
         cfg: settings of the run.
@@ -35,6 +38,8 @@ class Evaluator:
 
     def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device, ranks: "Ranks"):
         homes, n = factory.homes(cfg.env, cfg.geometry, "test"), cfg.evaluation.episodes
+        self.every, self.unit = settings.every(cfg.evaluation.every or 1)
+        self.stop, self.last = cfg.evaluation.stop, {"samples": 0.0, "seconds": 0.0}
         self.trained_in = trained_in
         self.gpus = [device] if torch.device(device).type == "cuda" else []
         with global_generators.kept(), torch.random.fork_rng(self.gpus):
@@ -47,7 +52,43 @@ class Evaluator:
                 text = f"no evaluation here measures it; {closest(name, names)}"
                 raise ConfigErrors([(f"evaluation.stop.{name}", text)])
 
-    def __call__(self, policy: Policy) -> dict[str, float]:
+    def on_start(self, trainer: "Trainer") -> None:
+        """Ends a run that has reached its end before."""
+        self.last = {"samples": trainer.samples_at_report, "seconds": trainer.clock.seconds}
+        if reaches(trainer.evaluation, self.stop):
+            trainer.end()
+
+    def on_update(self, trainer: "Trainer", losses: object) -> None:
+        """Forgets the score: it was another policy's."""
+        trainer.score = None
+
+    def on_measure(self, trainer: "Trainer", metrics: dict[str, Any]) -> None:
+        """Evaluates if it is time to, which all ranks do at once.
+
+        Metrics:
+            eval/NAME: what an evaluation in training measured: `return`, `length`, and each metric
+                of the environment, means over episodes in unseen homes.
+        """
+        now = {"samples": trainer.samples, "seconds": trainer.clock.seconds}
+        is_due = now[self.unit] // self.every > self.last[self.unit] // self.every
+        self.last, trainer.score = now, None
+        if not trainer.ranks.any(is_due):
+            return
+        for gpu in self.gpus:  # what other members of a population have launched counts
+            torch.cuda.synchronize(gpu)
+        with trainer.clock.paused():
+            measured = self.measure(trainer.policy)
+        trainer.evaluation = trainer.ranks.mean(measured)
+        trainer.score, trainer.is_save_due = trainer.evaluation.get("return"), True
+        metrics |= {f"eval/{name}": value for name, value in trainer.evaluation.items()}
+
+    def on_report(self, trainer: "Trainer", metrics: dict[str, Any]) -> None:
+        """Ends the run if the evaluation reaches `stop`."""
+        if trainer.is_save_due and reaches(trainer.evaluation, self.stop):
+            metrics["perf/seconds_to_stop"] = metrics["perf/seconds"]
+            trainer.end()
+
+    def measure(self, policy: Policy) -> dict[str, float]:
         """Returns the means of `return`, `length` and each metric of the environment, over the
         finished episodes of the lanes that learn, or of all if none does; NaN without one.
         """

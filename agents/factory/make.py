@@ -28,7 +28,6 @@ from megastep.capture import state_tree
 from megastep.imports import import_object
 from megastep.settings import parameters_of
 from megastep.types import PolicyLike, n_lanes, optional
-from megastep.wrappers import Wrapper
 
 if TYPE_CHECKING:
     from megastep.agents import types as agent_types
@@ -61,7 +60,9 @@ def construct(settings: "Component", constructor: Callable | None = None, **argu
                 # an environment may change a list that it is given, and the next gets it whole
                 values[key] = copy.deepcopy(value) if type(value) in (dict, list) else value
         values |= {key: value for key, value in arguments.items() if key in taken}
-        inside, outside = _wrappers_of(settings, taken) if is_env else ([], [])
+        inside, outside = [], []
+        if is_env and settings.wrappers:
+            inside, outside = _wrappers_of(settings, taken)
         if is_env and "wrappers" in taken:
             values["wrappers"] = tuple(inside)
         try:
@@ -79,6 +80,8 @@ def construct(settings: "Component", constructor: Callable | None = None, **argu
 
 def _wrappers_of(settings, taken) -> tuple[list[str], list]:
     """Returns the wrappers of an environment's own package, and the settings of megastep's."""
+    from megastep.wrappers import Wrapper
+
     inside, outside = [], []
     for item in settings.wrappers:
         name = item["name"] if isinstance(item, dict) else item
@@ -174,10 +177,11 @@ def make_policy(agent: Agent, env: types.Env, seed: int = 1, critic: str | None 
 
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> "agent_types.Learner":
     learner = construct(settings, policy=policy, seed=seed, graph=True)
-    with errors(f"{settings.name} is not a learner: "):
-        check_learner(learner)
-    with user_errors(f"{settings.name} is not a learner: ", (TypeError,)):
-        check_plain(learner.state_dict(), "state_dict")
+    if not settings.name.startswith("megastep."):
+        with errors(f"{settings.name} is not a learner: "):
+            check_learner(learner)
+        with user_errors(f"{settings.name} is not a learner: ", (TypeError,)):
+            check_plain(learner.state_dict(), "state_dict")
     return learner
 
 

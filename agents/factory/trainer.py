@@ -26,7 +26,7 @@ from megastep.agents.runs import (
 )
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training import budget, loggers
-from megastep.agents.training.callbacks import Evaluations, Snapshots
+from megastep.agents.training.callbacks import Snapshots
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.imports import import_object
@@ -43,7 +43,7 @@ def make_trainer(
     *,
     ranks: Ranks | None = None,
     callbacks: Sequence[object] = (),
-    make_evaluator: Callable | None = None,
+    make_evaluations: Callable | None = None,
     n_members: int = 1,
     homes: list[dict] | None = None,
 ) -> Trainer:
@@ -54,7 +54,7 @@ def make_trainer(
         token: a name that all ranks of this start have, and no other start.
         ranks: those that train the policy; None: all that there are.
         callbacks: of rank 0, before those of `cfg`.
-        make_evaluator: (cfg, env, device, ranks) -> what measures the policy in training.
+        make_evaluations: (cfg, env, device, ranks) -> a callback that evaluates in training.
         n_members: trainers of a population that memory is to hold from this one on.
         homes: the floor plans to train in, if they are made already.
     """
@@ -84,10 +84,8 @@ def make_trainer(
     resumed = loaded if cfg.resume else None
     had: dict = (resumed and resumed.state) or Counter()
     observers = []
-    if cfg.evaluation.every is not None and make_evaluator is not None:
-        evaluator = make_evaluator(cfg, env, device, ranks)
-        every = settings.every(cfg.evaluation.every)
-        observers.append(Evaluations(evaluator, every, cfg.evaluation.stop))
+    if cfg.evaluation.every is not None and make_evaluations is not None:
+        observers.append(make_evaluations(cfg, env, device, ranks))
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
     if resumed and number == 0:
         for name in "checkpoints", "snapshots":
@@ -194,8 +192,7 @@ def budget_of(
             assert loaded.state is not None
             recorded = recorded[: loaded.state["updates"]]
     limits = cfg.samples, cfg.seconds, cfg.learner.anneal
-    is_scheduled = bool(conflicts.schedules_of(cfg))
-    return budget.Budget(*limits, recorded, cfg.rerun is not None, is_scheduled)
+    return budget.Budget(*limits, recorded, cfg.rerun is not None)
 
 
 def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:

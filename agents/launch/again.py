@@ -36,8 +36,8 @@ def with_more(cfg: settings.Train) -> settings.Train:
     """Returns `cfg` with more_samples and more_seconds turned into totals of the resumed run."""
     totals = {}
     for name in ("samples", "seconds"):
-        if (more := getattr(cfg, f"more_{name}")) is not None and cfg.resume:
-            had = folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).numbers[name]
+        if (more := getattr(cfg, f"more_{name}")) is not None:
+            had = folders.load_checkpoint(folders.find(str(cfg.resume)), cfg.trust).numbers[name]
             totals |= {name: had + more, f"more_{name}": None}
     return settings.changed(cfg, **totals)
 

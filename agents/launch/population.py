@@ -19,7 +19,7 @@ from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, finishing
-from megastep.agents.launch.run import Run, evaluator, record
+from megastep.agents.launch.run import Run, evaluations, record
 from megastep.agents.population import decisions
 from megastep.agents.population.population import AgentParts, Population, Streams, hosted
 from megastep.agents.runs import checkpoint, folders, populations
@@ -85,7 +85,7 @@ class PopulationRun(Run):
                     *(own, folder, self.device),
                     ranks=ONE,
                     callbacks=[Progress(self.progress.show)] if member == 0 else (),
-                    make_evaluator=evaluator,
+                    make_evaluations=evaluations,
                     n_members=1 if self.trainers else len(members),
                     homes=homes,
                 )

@@ -121,11 +121,13 @@ class Run:
 
     def make(self, source: Any, token: str) -> None:
         """Makes what trains from what `open` returned, without waiting for other ranks."""
-        self.cfg = again.with_more(settings.changed(self.cfg, resume=source))
+        self.cfg = settings.changed(self.cfg, resume=source)
+        if source:
+            self.cfg = again.with_more(self.cfg)
         self.training = make_trainer(
             *(self.cfg, self.folder, self.device, token),
             callbacks=[Progress(self.progress.show)],
-            make_evaluator=evaluator,
+            make_evaluations=evaluations,
         )
         self.trainers = [self.training]
 
@@ -226,11 +228,11 @@ class Run:
         )
 
 
-def evaluator(*arguments: Any) -> Any:
-    """Returns an `Evaluator`, for `make_trainer`."""
+def evaluations(*arguments: Any) -> Any:
+    """Returns `Evaluations`, for `make_trainer`."""
     from megastep.agents.evaluation import in_training  # with all that evaluates
 
-    return in_training.Evaluator(*arguments)
+    return in_training.Evaluations(*arguments)
 
 
 def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:

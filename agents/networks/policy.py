@@ -92,12 +92,12 @@ class Policy(nn.Module):
     ):
         super().__init__()
         device = None
-        if hasattr(obs_space, "obs_space"):
+        if action_space is None:
             env = cast(Env, obs_space)
+            if not hasattr(env, "obs_space"):
+                raise ValueError("a policy needs an action space too: Policy(env), or both spaces")
             obs_space, action_space, device = env.obs_space, env.action_space, env.device
             privileged_space = optional(env, "privileged_space")
-        elif action_space is None:
-            raise ValueError("a policy needs an action space too: Policy(env), or both spaces")
         core, encoder = import_path(core), import_path(encoder)
         self.obs_space, self.action_space = obs_space, action_space
         self.settings = dict(
@@ -132,12 +132,6 @@ class Policy(nn.Module):
     def _critic(self) -> "Critic":
         assert self.critic is not None, "this policy has no critic"
         return self.critic
-
-    @property
-    def activation_bytes(self) -> int:
-        """About how many bytes of activations learning needs per step of one lane."""
-        # some 24 float32 per unit, and 8 for each layer above the first
-        return 4 * (24 + 8 * (self.layers - 1)) * self.width
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the hidden state of B lanes at the start of an episode: (B, ...) float32."""

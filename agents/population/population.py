@@ -30,7 +30,6 @@ from megastep.agents.distributed.process_group import (
 from megastep.agents.distributed.ranks import world
 from megastep.agents.population import decisions
 from megastep.agents.runs import json_lines, populations
-from megastep.agents.training.callbacks import Evaluations
 from megastep.agents.training.episode_stats import MIN_EPISODES
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import optional
@@ -190,15 +189,12 @@ class Population:
             return stop() or any(one.is_stopped for one in self.trainers)
 
         trainers, each, n_rounds = self.trainers, self.streams.each, 0
-        evaluates = any(isinstance(one, Evaluations) for one in self.leader.callbacks)
         try:
             each(lambda i: trainers[i].callbacks("on_start", trainers[i]))
             while (plan := self.leader.plan(ends(), world())).goes_on:
                 # all updates are launched before the first report waits for its own
                 each(lambda i: trainers[i].update(plan.lr_fraction))
                 if self.leader.updates % self.leader.log_every == 0:
-                    if evaluates:
-                        self.streams.wait()  # the clock pauses, and counts what is launched before
                     each(lambda i: trainers[i].report())
                 n_rounds += 1
                 # seconds count from the last of these on

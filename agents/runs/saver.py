@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 #: A replay buffer of up to so many bytes is in every checkpoint; in the last one of a run.
 SMALL_REPLAY, LAST_REPLAY = 2**28, 2**32
+#: The folder of a training without a run.
+NOWHERE = Path(os.devnull)
 #: Seconds that rank 0 waits for the other ranks' files.
 RANK_SECONDS = 60.0
 
@@ -36,7 +38,7 @@ class Saver:
     calls try again.
 
     Args:
-        folder: the run's `checkpoints` folder, which all ranks share.
+        folder: the run's `checkpoints` folder, which all ranks share. `NOWHERE`: nothing is saved.
         config: the run's configuration, stored in each checkpoint.
         keep_checkpoints, made_with: see `checkpoint.save`.
         replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is saved once per
@@ -87,6 +89,8 @@ class Saver:
         Raises:
             NonFiniteError: policy or learner have a NaN or infinity. Earlier checkpoints are kept.
         """
+        if self.folder == NOWHERE:
+            return
         self.wait()
         self._number += 1
         state, devices = self._with_replay(state, is_last), set()
@@ -188,18 +192,6 @@ class Saver:
         if not has_warned:
             text = f"{self.error}. Training goes on; the next checkpoint tries again"
             warnings.warn(text, stacklevel=2)
-
-
-class NoSaver(Saver):
-    """Saves nothing: for a training without a run folder."""
-
-    def __init__(self) -> None:
-        super().__init__(Path(os.devnull), {})
-
-    def __call__(
-        self, step: int, state: StateDict, score: float | None = None, is_last: bool = False
-    ) -> None:
-        """Does nothing."""
 
 
 def _on_host(node, path, pinned, devices) -> object:

@@ -30,7 +30,6 @@ class Budget:
         recorded: the factors of the learning rate in the first updates, as an earlier run of the
             same configuration recorded them (`annealing`). They replace the clock's.
         is_rerun: the run ends after the updates that are recorded.
-        is_scheduled: settings follow the budget, even if the learning rate does not.
     """
 
     samples: int | None = None
@@ -38,7 +37,6 @@ class Budget:
     anneal: str = "never"
     recorded: Sequence[float] = ()
     is_rerun: bool = False
-    is_scheduled: bool = False
 
     @property
     def is_limited(self) -> bool:
@@ -56,12 +54,10 @@ class Budget:
 
     def lr_fraction(self, updates: int, samples: int, seconds: float) -> float:
         """Returns the fraction of the budget that is left for the next update, from 1 to 0: the
-        factor of the learning rate if it is annealed, and what schedules follow. Else 1.
+        factor of the learning rate if it is annealed, and what schedules follow.
         """
         if updates < len(self.recorded):
             return self.recorded[updates]
-        if self.anneal == "never" and not self.is_scheduled:
-            return 1.0
         if self.anneal == "samples" or (self.anneal == "never" and self.samples is not None):
             return max(0.0, _fraction_left(samples, self.samples))
         return max(0.0, _fraction_left(seconds, self.seconds))

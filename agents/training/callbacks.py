@@ -21,12 +21,10 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.process_group import rank_label
 from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.errors import UserError, shortened
-from megastep.agents.training.budget import reaches
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
-    from megastep.agents.networks.policy import Policy
     from megastep.agents.runs.saver import Saver
     from megastep.agents.training.trainer import Trainer
     from megastep.agents.types import Learner, RolloutLike
@@ -179,61 +177,6 @@ class NonFiniteGuard:
             f"too large ({text if value else 'gradients'}). {advice}",
             is_from_env,
         )
-
-
-class Evaluations:
-    """Evaluates the policy for some reports. A checkpoint follows, whose score is the return.
-
-    Args:
-        measure: returns numbers by name, and changes nothing of the training. Its time does not
-            count.
-        every: (number, "samples" or "seconds"): evaluates for the first report after each so many.
-        stop: by name, the least that ends the run if all are reached.
-    """
-
-    def __init__(
-        self,
-        measure: Callable[[Policy], Mapping[str, float]],
-        every: tuple[float, str],
-        stop: Mapping[str, float],
-    ):
-        self.measure, self.every, self.stop = measure, every, stop
-        self.last = {"samples": 0.0, "seconds": 0.0}
-
-    def on_start(self, trainer: Trainer) -> None:
-        """Ends a run that has reached its end before."""
-        self.last = {"samples": trainer.samples_at_report, "seconds": trainer.clock.seconds}
-        if reaches(trainer.evaluation, self.stop):
-            trainer.end()
-
-    def on_update(self, trainer: Trainer, losses: object) -> None:
-        """Forgets the score: it was another policy's."""
-        trainer.score = None
-
-    def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
-        """Evaluates if it is time to, which all ranks do at once.
-
-        Metrics:
-            eval/NAME: what an evaluation in training measured: `return`, `length`, and each metric
-                of the environment, means over episodes in unseen homes.
-        """
-        every, unit = self.every
-        now = {"samples": trainer.samples, "seconds": trainer.clock.seconds}
-        is_due = now[unit] // every > self.last[unit] // every
-        self.last, trainer.score = now, None
-        if not trainer.ranks.any(is_due):
-            return
-        with trainer.clock.paused():
-            measured = self.measure(trainer.policy)
-        trainer.evaluation = trainer.ranks.mean({**measured})
-        trainer.score, trainer.is_save_due = trainer.evaluation.get("return"), True
-        metrics |= {f"eval/{name}": value for name, value in trainer.evaluation.items()}
-
-    def on_report(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
-        """Ends the run if the evaluation reaches `stop`."""
-        if trainer.is_save_due and reaches(trainer.evaluation, self.stop):
-            metrics["perf/seconds_to_stop"] = metrics["perf/seconds"]
-            trainer.end()
 
 
 class Snapshots:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.ranks import Plan, Ranks, world
-from megastep.agents.runs.saver import NoSaver, Saver
+from megastep.agents.runs.saver import NOWHERE, Saver
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.callbacks import Callbacks, Losses, NonFiniteGuard
 from megastep.agents.training.episode_stats import Episodes
@@ -41,7 +41,7 @@ class Trainer:
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
         clock: counts the seconds of training.
-        lr, lr_fraction: the learning rate, and its annealing factor in this update.
+        lr, lr_fraction: the learning rate, and the fraction of the budget left for this update.
         rollout, metrics: the latest rollout, and the last report.
         latest_stats, evaluation: name -> the last value of each statistic of episodes, and of each
             number that an evaluation in training measured.
@@ -74,7 +74,7 @@ class Trainer:
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.budget = Budget() if budget is None else budget
-        self.saver = NoSaver() if saver is None else saver
+        self.saver = Saver(NOWHERE, {}) if saver is None else saver
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
         self.ranks = world() if ranks is None else ranks
         self.collect = learner.collector(env)
