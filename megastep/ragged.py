@@ -45,18 +45,35 @@ class Ragged(SetOnce):
 
     def __init__(self, vals: Array, widths: Array):
         integers: Any = np.zeros(0, int) if len(widths) == 0 else widths
-        if isinstance(self, RaggedTorch):
+        is_torch = isinstance(self, RaggedTorch)
+        if is_torch:
             self.vals = torch.as_tensor(vals)
             integers = torch.as_tensor(integers, device=self.vals.device)
-            _check(self.vals, integers)
-            self.widths = integers.long()
         else:
             self.vals = np.asarray(vals)
-            integers = np.asarray(
-                integers.cpu() if isinstance(integers, torch.Tensor) else integers
+            integers = integers.cpu() if isinstance(integers, torch.Tensor) else integers
+            integers = np.asarray(integers)
+        if self.vals.ndim == 0:
+            raise ValueError("the vals of a Ragged need at least one axis, but are a single number")
+        if integers.ndim != 1:
+            shape = tuple(integers.shape)
+            raise ValueError(
+                f"the widths of a Ragged need exactly one axis, but have shape {shape}"
             )
-            _check(self.vals, integers)
-            self.widths = integers.astype(np.int64, copy=False)
+        listed = np.asarray(integers.tolist() or np.zeros(0, int))
+        if listed.dtype.kind not in "iu":
+            raise ValueError(f"the widths of a Ragged must be integers, but are {integers.dtype}")
+        if (listed < 0).any():
+            i = int(listed.argmin())
+            raise ValueError(
+                f"the widths of a Ragged must not be negative, but widths[{i}] is {listed[i]}"
+            )
+        if listed.sum() != len(self.vals):
+            raise ValueError(
+                f"the widths of a Ragged must add up to its {len(self.vals)} vals, but add up to "
+                f"{listed.sum()}"
+            )
+        self.widths = integers.long() if is_torch else integers.astype(np.int64, copy=False)
 
     @cached_property
     def ends(self) -> Array:
@@ -163,25 +180,3 @@ class RaggedTorch(Ragged):
     def clone(self) -> "RaggedTorch":
         """Returns a copy with tensors of its own."""
         return RaggedTorch(self.vals.clone(), self.widths.clone())
-
-
-def _check(vals: Array, widths: Array) -> None:
-    if vals.ndim == 0:
-        raise ValueError("the vals of a Ragged need at least one axis, but are a single number")
-    if widths.ndim != 1:
-        raise ValueError(
-            f"the widths of a Ragged need exactly one axis, but have shape {tuple(widths.shape)}"
-        )
-    listed = np.asarray(widths.tolist() or np.zeros(0, int))
-    if listed.dtype.kind not in "iu":
-        raise ValueError(f"the widths of a Ragged must be integers, but are {widths.dtype}")
-    if (listed < 0).any():
-        i = int(listed.argmin())
-        raise ValueError(
-            f"the widths of a Ragged must not be negative, but widths[{i}] is {listed[i]}"
-        )
-    if listed.sum() != len(vals):
-        raise ValueError(
-            f"the widths of a Ragged must add up to its {len(vals)} vals, but add up to "
-            f"{listed.sum()}"
-        )

@@ -9,6 +9,8 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 __all__ = ["ReadOnlyTensor", "SetOnce"]
 
 _WRITING = ("__setitem__", "__delitem__", "__set__", "__delete__")
+# Names that start like in-place operators, but only read.
+_READING = ("__index__", "__int__", "__invert__", "__init__", "__init_subclass__", "__iter__")
 
 
 class ReadOnlyTensor(torch.Tensor):
@@ -28,7 +30,9 @@ class ReadOnlyTensor(torch.Tensor):
     def __torch_function__(cls, function, types, args=(), kwargs=None) -> object:
         kwargs = kwargs or {}
         name = getattr(function, "__name__", "")
-        for tensor in tree_leaves([kwargs.get("out"), args[:1] if _writes(name) else None]):
+        in_place = name.endswith("_") and not name.endswith("__") or name.startswith("__i")
+        writes = (in_place or name in _WRITING) and name not in _READING
+        for tensor in tree_leaves([kwargs.get("out"), args[:1] if writes else None]):
             if isinstance(tensor, cls):
                 raise ValueError(tensor.refusal)
         refusals = {}
@@ -56,15 +60,6 @@ class ReadOnlyTensor(torch.Tensor):
         self, *args: object, **kwargs: object
     ) -> NoReturn:  # the one method that skips __torch_function__
         raise ValueError(self.refusal)
-
-
-def _writes(name: str) -> bool:
-    in_place = name.endswith("_") and not name.endswith("__")
-    return in_place or name in _WRITING or name.startswith("__i") and name not in _READING
-
-
-# Names that start like in-place operators, but only read.
-_READING = ("__index__", "__int__", "__invert__", "__init__", "__init_subclass__", "__iter__")
 
 
 class SetOnce:

@@ -9,6 +9,7 @@ import torch
 from megastep import engine
 from megastep.colour import gamma_decode
 from megastep.engine import checks
+from megastep.engine.operations import bake_cached
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.ragged import Ragged
 
@@ -41,6 +42,9 @@ def linear(palette) -> np.ndarray:
     )
 
 
+WALL_COLOURS, AGENT_COLOURS, (FRONT_COLOUR,) = map(linear, (PALETTE, AGENT_PALETTE, [FRONT]))
+
+
 def texel_widths(lines: np.ndarray) -> np.ndarray:
     """Returns the number of 5 cm texels, (L,) int64 and at least 1, of lines (L, 2, 2)."""
     lengths = np.linalg.norm(lines[:, 1].astype(float) - lines[:, 0], axis=-1)
@@ -63,9 +67,9 @@ def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
     the number of texels per line, (A M,).
     """
     widths = texel_widths(model)
-    bodies, front = linear(AGENT_PALETTE), linear([FRONT])[0]
-    colours = np.repeat(bodies[np.arange(n_agents) % len(bodies), None], len(model), 1)
-    colours[:, model.mean(1)[:, 0].argmax()] = front
+    bodies = AGENT_COLOURS[np.arange(n_agents) % len(AGENT_COLOURS), None]
+    colours = np.repeat(bodies, len(model), 1)
+    colours[:, model.mean(1)[:, 0].argmax()] = FRONT_COLOUR
     widths = np.tile(widths, n_agents)
     return np.repeat(colours.reshape(-1, 3), widths, 0), widths
 
@@ -74,7 +78,7 @@ def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray
     """Returns the texels, (T, 3), of walls with ``widths``, (W,), texels each: stripes of two
     colours with a random period, phase and duty cycle.
     """
-    n, palette = len(widths), linear(PALETTE)
+    n, palette = len(widths), WALL_COLOURS
     base = palette[random.integers(len(palette), size=n)] * random.uniform(0.6, 1.0, (n, 1))
     stripe = palette[random.integers(len(palette), size=n)] * random.uniform(0.2, 0.8, (n, 1))
     period = random.uniform(*STRIPE, n)
@@ -87,14 +91,15 @@ def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray
     return np.concatenate([base, stripe]).astype(np.float32)[wall + n * striped]
 
 
-def _sort_along_z_curve(walls) -> np.ndarray:
-    """Sorts walls (M, 2, 2) along a Z-order curve through 1 m cells, so that each group of 32 walls
-    lies close together.
+def _sorted_along_z_curve(parts) -> np.ndarray:
+    """Returns the walls (M, 2, 2) of all layouts, those of each along a Z-order curve through 1 m
+    cells, so that each group of 32 walls lies close together.
     """
+    walls = np.concatenate(parts)
     cells = walls.mean(1).astype(np.int64)
-    order = sum(
-        ((cells >> bit & 1) << np.array([2 * bit, 2 * bit + 1])).sum(-1) for bit in range(8)
-    )
+    order = np.repeat(np.arange(len(parts)), [len(part) for part in parts]) << 16
+    for bit in range(8):
+        order += ((cells >> bit & 1) << np.array([2 * bit, 2 * bit + 1])).sum(-1)
     return walls[np.argsort(order, kind="stable")]
 
 
@@ -171,7 +176,7 @@ def scenery(
     engine.fit(n_envs, 20 * n_agents * len(model) + 4 * len(agent_textures) + 64, device)
 
     wall_parts, light_parts = _part(geometries, "walls", (2, 2)), _part(geometries, "lights", (2,))
-    walls = np.concatenate([_sort_along_z_curve(part) for part in wall_parts]).astype(np.float32)
+    walls = _sorted_along_z_curve(wall_parts).astype(np.float32)
     widths = texel_widths(walls)
     positions = np.concatenate(light_parts)
     intensities = random.uniform(*INTENSITY, (len(positions), 1))
@@ -187,7 +192,7 @@ def scenery(
     )
     layout = _first_layouts(n_envs, len(geometries))
     result = Scenery(n_agents, layouts, model, model_widths, layout)
-    engine.bake(result)
+    bake_cached(result)
     return result
 
 

@@ -9,6 +9,7 @@ The command line makes a dataclass of the same arguments with `settings_of`. Tru
 "3" is not a number, and numbers are finite, but for those of users' classes.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import functools
@@ -200,6 +201,20 @@ def _has_members(protocol, value) -> object:
     return value
 
 
+_is_checking = True
+
+
+@contextlib.contextmanager
+def already_checked(are_checked: bool = True) -> Iterator[None]:
+    """Inside, `checked` functions take arguments as they are: they are fields of settings."""
+    global _is_checking
+    before, _is_checking = _is_checking, _is_checking and not are_checked
+    try:
+        yield
+    finally:
+        _is_checking = before
+
+
 def checked(function: F) -> F:
     """Decorator: checks a function's arguments against its annotations. The function gets its
     arguments as they are, not copies, unlike with `pydantic.validate_call`. Raises ValueError
@@ -210,6 +225,8 @@ def checked(function: F) -> F:
 
     @functools.wraps(function)
     def wrapped(*args, **kwargs) -> object:
+        if not _is_checking:
+            return function(*args, **kwargs)
         arguments = signature.bind(*args, **kwargs).arguments
         fields = settings().__pydantic_fields__
         values = {name: plain(value) for name, value in arguments.items() if name in fields}

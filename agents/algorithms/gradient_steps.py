@@ -121,9 +121,10 @@ class GradientSteps:
         """Computes the gradient of a loss (), a mean over the `n_valid` () valid transitions of a
         minibatch. Returns the metrics () of all ranks, which `end` averages over the steps taken.
         """
-        self.optimizer.zero_grad()
-        loss.backward()
         parameters = self.optimizer.parameters
+        for parameter in parameters:
+            parameter.grad = None
+        loss.backward()
         n_valid, means = average_gradients(parameters, n_valid, [*metrics.values()])
         self.n_valid, self.metrics = n_valid.long(), dict(zip(metrics, means, strict=True))
         return self.metrics

@@ -105,6 +105,7 @@ class GradientLearner:
         coefficients: the `Coefficients` of the loss, and `lr`.
         steps: the `GradientSteps` of the policy's parameters.
         generator: the `SeededGenerator` of all random numbers in an update.
+        has_extra_loss: whether a subclass has an `extra_loss` of its own.
         loss_coefficients: numbers and schedules of the loss by name, besides `gamma`.
     """
 
@@ -132,6 +133,7 @@ class GradientLearner:
         seed: int = 1,
     ):
         self.policy, self.device, self.n_steps = policy, policy.device, n_steps
+        self.has_extra_loss = type(self).extra_loss is not GradientLearner.extra_loss
         numbers = dict(lr=lr, gamma=gamma, **self.loss_coefficients)
         self.coefficients = Coefficients(policy.device, **numbers)
         self.lr, self.warmup = self.coefficients.values["lr"], warmup
@@ -230,11 +232,6 @@ class GradientLearner:
         errors = self.policy.prediction_error(features, privileged)
         error = masked_mean(errors, batch["valid"])
         return self.coefficients["auxiliary_coef"] * error, {"auxiliary": error}
-
-    @property
-    def has_extra_loss(self) -> bool:
-        """Whether a subclass has an `extra_loss` of its own."""
-        return type(self).extra_loss is not GradientLearner.extra_loss
 
     def _make_extra(self) -> list[torch.nn.Parameter]:
         with torch.random.fork_rng(devices=[]):

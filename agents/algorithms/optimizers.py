@@ -45,11 +45,6 @@ class _Optimizer:
         gradients = [p.grad for p in self.parameters if p.grad is not None]
         return torch.nn.utils.get_total_norm(gradients)
 
-    def zero_grad(self) -> None:
-        """Frees the gradients."""
-        for p in self.parameters:
-            p.grad = None
-
 
 class Adam(_Optimizer):
     """Adam (Kingma and Ba 2015), with decoupled weight decay (AdamW, Loshchilov and Hutter 2019).

@@ -131,6 +131,10 @@ class Composer:
         try:
             keys = [one.key for one in typed if not one.key.startswith("hydra")]
             tree = self.command.prepare(own(config, resolve=not secret), keys)
+            if tree.get("geometry", {}).get("name") == components.HOMES:
+                from megastep.geometries import databases
+
+                databases.prefetch()  # while PyTorch is imported
             groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
             chosen = check.check(self.command.kind, tree, groups + self.loader.list_groups(""))
             errors += conflicts.ignored_geometry(chosen.env, keys)

@@ -26,7 +26,7 @@ from megastep.agents.training import loggers
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.capture import state_tree
 from megastep.imports import import_object
-from megastep.settings import parameters_of
+from megastep.settings import already_checked, parameters_of
 from megastep.types import PolicyLike, n_lanes, optional
 
 if TYPE_CHECKING:
@@ -66,7 +66,8 @@ def construct(settings: "Component", constructor: Callable | None = None, **argu
         if is_env and "wrappers" in taken:
             values["wrappers"] = tuple(inside)
         try:
-            made = constructor(**values)
+            with already_checked(constructor.__module__.startswith("megastep.")):
+                made = constructor(**values)
             for number, wrapper in enumerate(outside):
                 seed = stream_seed(arguments.get("seed", 1), f"wrapper {number}")
                 made = construct(wrapper, env=made, seed=seed)
@@ -172,7 +173,8 @@ def make_policy(agent: Agent, env: types.Env, seed: int = 1, critic: str | None 
     with errors():
         spaces = env.obs_space, env.action_space, optional(env, "privileged_space")
         arguments: dict = vars(agent) | {"critic": critic}
-        return Policy(*spaces, seed=seed, **arguments).to(env.device)
+        with already_checked():
+            return Policy(*spaces, seed=seed, **arguments).to(env.device)
 
 
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> "agent_types.Learner":

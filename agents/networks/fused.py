@@ -30,15 +30,18 @@ LIBRARY = KernelLibrary(
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
 #: Names of the operations that have a fused form, such as `returns.gae`.
 OPERATIONS: set[str] = set()
+uses_gpu = torch.cuda.is_initialized
 #: Those that run in their plain form.
 _plain: frozenset[str] = frozenset()
 
 Operation = Callable[..., Any]
 
 
-def fused(kernel: Operation, fits: Callable[..., bool]) -> Callable[[Operation], Any]:
+def fused(
+    kernel: Operation, fits: Callable[..., bool], on_cpu: bool = False
+) -> Callable[[Operation], Any]:
     """Decorates an operation in PyTorch: `kernel` computes the same from the same arguments, if
-    `fits` returns that it takes them.
+    `fits` returns that it takes them. Only where a GPU is in use, unless it runs `on_cpu` too.
     """
 
     def decorate(operation: Operation) -> Operation:
@@ -47,7 +50,8 @@ def fused(kernel: Operation, fits: Callable[..., bool]) -> Callable[[Operation],
 
         @functools.wraps(operation)
         def chosen(*args, **options) -> object:
-            if name not in _plain and fits(*args, **options):
+            is_possible = name not in _plain and (on_cpu or uses_gpu())
+            if is_possible and fits(*args, **options):
                 return kernel(*args, **options)
             return operation(*args, **options)
 

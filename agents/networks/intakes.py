@@ -182,6 +182,8 @@ class ConcatIntake(nn.Module):
     Initially every leaf has the same weight, however many numbers it has: weights have variance
     2 / (leaves x features of the leaf), which preserves the size of the inputs (He et al. 2015).
 
+    `running_norms` are its normalisations by running statistics.
+
     Images have an encoder, "linear", "conv", "cnn" or an import path. The activation is "relu" or
     "tanh". `n_features` counts those of all leaves together, before the projection. ValueError if a
     space is of an unknown kind, or nothing is observed.
@@ -204,6 +206,7 @@ class ConcatIntake(nn.Module):
             RunningNorm(leaf) if getattr(encoder, "is_normalised", True) else nn.Identity()
             for leaf, encoder in zip(leaves.values(), encoders)
         )
+        self.running_norms = [norm for norm in self.norms if isinstance(norm, RunningNorm)]
         #: whether a kernel may normalise all leaves side by side
         self.is_fused = all(vars(type(encoder)).get("takes_parts") for encoder in encoders)
         sizes = [encoder.n_features for encoder in encoders]
@@ -285,11 +288,6 @@ class ConcatIntake(nn.Module):
             part = part if i is None else self.encoders[i](part.unflatten(-1, shape))
             features.append(part.contiguous())  # so that `cat` is several times faster
         return torch.cat(features, -1)
-
-    @property
-    def running_norms(self) -> list[RunningNorm]:
-        """Normalisations by running statistics."""
-        return [norm for norm in self.norms if isinstance(norm, RunningNorm)]
 
     def normalised_leaves(self, obs: Tree) -> list[torch.Tensor]:
         """Returns the leaf of each of `running_norms`."""

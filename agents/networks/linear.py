@@ -172,7 +172,7 @@ def _by_kernel(x, layer, activation=None) -> torch.Tensor:
     return _Layer.apply(layer.weight, layer.bias, activation, *parts)
 
 
-@fused(_by_kernel, _fits)
+@fused(_by_kernel, _fits, on_cpu=True)
 def linear(
     x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
     layer: nn.Linear,

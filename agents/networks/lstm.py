@@ -225,6 +225,7 @@ def _by(form) -> Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
         and x.shape[-1] % 16 == 0
         and is_built_for_cpu()
     ),
+    on_cpu=True,
 )
 @fused(_by(ON_CLUSTERS), _fits_clusters)
 def lstm_sequence(

@@ -254,7 +254,7 @@ class MinGRU(nn.Module):
         """Returns the hidden state of B lanes at the start of an episode."""
         return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
 
-    @fused(_sequence, lambda core, *_, **__: compute_dtype(core.input.weight) in DTYPES)
+    @fused(_sequence, lambda core, *_, **__: compute_dtype(core.input.weight) in DTYPES, True)
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:

@@ -7,10 +7,10 @@ T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, 
 import copy
 import functools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import torch
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, SkipValidation
 from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
@@ -23,7 +23,6 @@ from megastep.settings import checked
 from megastep.types import Env, Space, Tree, optional
 
 if TYPE_CHECKING:
-    from megastep.agents.networks.critic import Critic
     from megastep.agents.types import Moments
 
 #: Prefixes of the weights that acting does not need, in a policy's `state_dict`.
@@ -63,6 +62,7 @@ class Policy(nn.Module):
     Attributes:
         generator: the `SeededGenerator` of the actions. A learner saves its state.
         obs_space, action_space, settings: what it was made of, `settings` from `width` to `bf16`.
+        norms: the running statistics of observations, the critic's too.
 
     Weights used in training only are under `TRAINING_ONLY` in `state_dict()`.
 
@@ -75,9 +75,9 @@ class Policy(nn.Module):
     @checked
     def __init__(
         self,
-        obs_space: Space | Env,
-        action_space: Space | None = None,
-        privileged_space: Space | None = None,
+        obs_space: SkipValidation[Space | Env],
+        action_space: SkipValidation[Space | None] = None,
+        privileged_space: SkipValidation[Space | None] = None,
         *,
         width: Annotated[int, Field(ge=1, le=8192)] = 256,
         core: Annotated[str | type, _name_in(cores.CORES)] = "lstm",
@@ -113,12 +113,14 @@ class Policy(nn.Module):
             self.intake = heads.intake(obs_space, width, encoder, activation)
             self.core = cores.make_core(core, width, layers, activation)
             self.output = heads.output(action_space, width, output, continuous)
-            self.critic = None
+            self.norms = [*self.intake.running_norms]
+            self.critic: Any = None
             if critic is not None:
                 from megastep.agents.networks.critic import Critic  # who acts has none
 
                 self.critic = Critic(width, self.privileged_space)
                 if self.privileged_space:
+                    self.norms += self.critic.intake.running_norms
                     self.prediction = nn.Linear(width, self.critic.intake.n_features)
         if device is not None:
             self.to(device)
@@ -127,11 +129,6 @@ class Policy(nn.Module):
     def device(self) -> torch.device:
         """Device of the weights."""
         return self.intake.project.weight.device  # `parameters` walks through all modules
-
-    @property
-    def _critic(self) -> "Critic":
-        assert self.critic is not None, "this policy has no critic"
-        return self.critic
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the hidden state of B lanes at the start of an episode: (B, ...) float32."""
@@ -235,7 +232,7 @@ class Policy(nn.Module):
         if self.critic is None:
             raise ValueError("the policy has no critic; files of agents and snapshots have none")
         with self.compute_dtype():
-            return self._critic(features, self._critic.encode(privileged, lanes))
+            return self.critic(features, self.critic.encode(privileged, lanes))
 
     def prediction_error(
         self, features: torch.Tensor, privileged: Tree, lanes: torch.Tensor | None = None
@@ -248,7 +245,7 @@ class Policy(nn.Module):
         from megastep.agents.networks.critic import prediction_error
 
         with self.compute_dtype():
-            encoded = self._critic.intake.encode(privileged, lanes)
+            encoded = self.critic.intake.encode(privileged, lanes)
             return prediction_error(self.prediction, features, encoded)
 
     def terms(
@@ -272,9 +269,9 @@ class Policy(nn.Module):
 
         with self.compute_dtype():
             features, _ = self._features(obs, reset, state, lanes)
-            encoded = self._critic.encode(privileged, lanes)
+            encoded = self.critic.encode(privileged, lanes)
             prediction = self.prediction if self.privileged_space and has_errors else None
-            heads_of = self.output, self._critic, prediction
+            heads_of = self.output, self.critic, prediction
             terms = head_terms(*heads_of, features, encoded, actions, mask)
         names = "logprobs", "entropies", "errors", "values", "features"
         return arrdict(zip(names, (*terms, features), strict=True))
@@ -293,7 +290,7 @@ class Policy(nn.Module):
         absent = {id(getattr(self, name, None)): None for name in ("critic", "prediction")}
         generator = SeededGenerator(self.generator.seed)
         actor = copy.deepcopy(self, {id(self.generator): generator, **absent})
-        actor.privileged_space = None
+        actor.privileged_space, actor.norms = None, actor.intake.running_norms
         return actor.requires_grad_(False)
 
     def update_stats(
@@ -312,24 +309,20 @@ class Policy(nn.Module):
         """Returns the moments of this rank's observations, see `update_stats`."""
         observations = self.intake.normalised_leaves(obs)
         if self.privileged_space:
-            observations += self._critic.intake.normalised_leaves(privileged)
-        return running_norm.moments_of(self._norms(), observations, is_counted)
+            observations += self.critic.intake.normalised_leaves(privileged)
+        return running_norm.moments_of(self.norms, observations, is_counted)
 
     def add_moments(
         self, moments: "Sequence[Moments]", is_counted: torch.Tensor | None = None
     ) -> None:
         """Adds pooled `moments` to the statistics, unless `is_counted`, () bool, is false."""
-        running_norm.add_moments(self._norms(), moments, is_counted)
+        running_norm.add_moments(self.norms, moments, is_counted)
 
     def clear_stats(self) -> None:
         """Makes observations and values 0 until there are statistics of them, so that learning does
         not depend on their units.
         """
-        for norm in self._norms():
+        for norm in self.norms:
             norm.clear()
         if self.critic is not None:
             self.critic.output.clear()
-
-    def _norms(self) -> list[running_norm.RunningNorm]:
-        norms = self.intake.running_norms
-        return norms + self._critic.intake.running_norms if self.privileged_space else norms

@@ -66,6 +66,8 @@ def _is_plain_copy(target, source) -> bool:
 
 def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[torch.Tensor]:
     """Returns `tensor.index_select(1, lanes)` of tensors (T, B, ...), on a GPU in one kernel."""
+    if not lanes.is_cuda:
+        return [tensor.index_select(1, lanes) for tensor in tensors]
     results = {}
     fused = [i for i, tensor in enumerate(tensors) if _can_select(tensor, len(lanes))]
     for start in range(0, len(fused), _MAX_SELECTED):

@@ -194,7 +194,7 @@ class Rollout:
         if self.privileged is not None:
             world["privileged"] = self.privileged[t]
         if self.mask is not None:
-            world["mask"] = mapping(lambda leaf: leaf[t])(self.mask)
+            world["mask"] = self.mask[t]
         return world
 
     def floats(self) -> dict[str, torch.Tensor]:
@@ -240,11 +240,10 @@ class Rollout:
         """
         parts = arrdict({name: getattr(self, name) for name in names})
         parts = arrdict({name: part for name, part in parts.items() if part is not None}, **others)
-        # the hidden state as one step
-        parts["state"] = mapping(lambda leaf: leaf[None])(self.state)
+        parts["state"] = self.state[None]  # as one step
         leaves, spec = tree_flatten(parts)
         batch = tree_unflatten(select_lanes(leaves, lanes), spec)
-        batch["state"] = mapping(lambda leaf: leaf[0])(batch["state"])
+        batch["state"] = batch["state"][0]
         return batch
 
 
@@ -288,7 +287,7 @@ def copy_tree(target: Tree, source: Tree) -> None:
 
 def without_last(tree: Tree) -> Tree:
     """Returns the first T of T+1 rows, those with actions, of a tree of tensors or of None."""
-    return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
+    return None if tree is None else tree[:-1]
 
 
 def _pairs(rows, t, tree) -> Pairs:

@@ -33,15 +33,10 @@ def scenery_params(scenery: Scenery, radius: float) -> bytes:
     # a copy's tensors lie elsewhere
     key = _address(scenery.layout), _address(scenery.layouts.texels), radius, n_threads
     packed = vars(scenery).get("_packed")
-    if packed is None or packed.key != key:
-        packed = _Cached(key, _pack_scenery(scenery, radius, n_threads))
-        vars(scenery)["_packed"] = packed
-    return packed.value
-
-
-def _pack_scenery(scenery, radius, n_threads) -> bytes:
+    if packed is not None and packed.key == key:
+        return packed.value
     layouts = scenery.layouts
-    return ENGINE.params.SceneryParams(
+    struct = ENGINE.params.SceneryParams(
         walls=layouts.lines.vals,
         wall_starts=layouts.wall_starts,
         texel_starts=layouts.texel_starts,
@@ -65,6 +60,8 @@ def _pack_scenery(scenery, radius, n_threads) -> bytes:
         radius=radius,
         reach=1.001 * scenery.reach,
     )
+    vars(scenery)["_packed"] = _Cached(key, struct)
+    return struct
 
 
 _NO_OBJECTS = bytes(ctypes.sizeof(ENGINE.structs["ObjectsParams"]))

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 
+from megastep import cache
 from megastep.devices import n_resident_threads, threads
 from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
@@ -27,6 +28,8 @@ GROUPS = (32, 16, 8)
 #: Blocks that a multiprocessor holds, by the bounds of `physics_unspilled`.
 UNSPILLED_BLOCKS = 18
 APART = 0.05  # metres
+#: Of baked light in the cache: the beginning of files' names, their number, and the fewest layouts.
+PREFIX, MAX_FILES, MIN_CACHED = "baked-light-", 16, 32
 
 
 def bake(scenery: Scenery) -> None:
@@ -43,6 +46,24 @@ def bake(scenery: Scenery) -> None:
         wall_layout=_owners(layouts.lines.widths, layouts.n_walls),
         n_texels=layouts.n_texels,
     )
+
+
+def bake_cached(scenery: Scenery) -> None:
+    """Does what :func:`bake` does, on a CPU by the cache on disk: 512 homes take half a second."""
+    layouts = scenery.layouts
+    if scenery.device.type != "cpu" or len(layouts) < MIN_CACHED:
+        return bake(scenery)
+
+    def build() -> dict:
+        bake(scenery)
+        return dict(light=layouts.baked.vals.numpy())
+
+    of_lights = layouts.lights.vals, layouts.light_starts
+    tensors = layouts.lines.vals, layouts.wall_starts, layouts.texel_starts, *of_lights
+    parts = ENGINE.sources(".h", ".cpp"), *(tensor.numpy() for tensor in tensors)
+    light = cache.arrays(PREFIX, parts, build, MAX_FILES)["light"]
+    layouts.baked.vals.copy_(torch.from_numpy(light))
+    return None
 
 
 def _owners(widths, total) -> torch.Tensor:

@@ -199,7 +199,12 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
     half_width = math.tan(math.radians(agents.fov / 2))
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)  # of an agent
     n = scenery.n_envs * scenery.n_agents
-    kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
+    kernel, n_threads, room = "render", WARP * n, n_resident_threads(device)
+    if "indices" not in outputs and n_threads <= UNSPILLED_WAVES * room:
+        kernel = "render_unspilled"  # with more registers for each warp, until agents are many
+        # two warps per agent, if agents are few, share whole tiles of the screen: of whole pixels
+        if 2 * n_threads <= room and res > WARP and WARP % subsample == 0:
+            kernel = "render_split"
     n_warps = BLOCK // WARP
     n_per_block = 1 if kernel == "render_split" else n_warps
     shared *= n_per_block
@@ -228,14 +233,3 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
         **{**_OPTIONAL, **outputs},
     )
     check_on_cpu(agents)
-
-
-def _kernel(scenery, res, subsample) -> str:
-    """Returns the kernel that renders observations: with two warps per agent if agents are few,
-    with more registers for each warp until they are many. Two warps share whole tiles of the
-    screen, which must hold whole pixels.
-    """
-    n_threads, room = WARP * scenery.n_envs * scenery.n_agents, n_resident_threads(scenery.device)
-    if 2 * n_threads <= room and res > WARP and WARP % subsample == 0:
-        return "render_split"
-    return "render_unspilled" if n_threads <= UNSPILLED_WAVES * room else "render"

@@ -13,6 +13,7 @@ import functools
 import hashlib
 import io
 import os
+import threading
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -122,6 +123,11 @@ def draw(members: Sequence[int], n: int, seed: int) -> list[int]:
 
 
 # ---- Homes ----
+
+
+def prefetch() -> None:
+    """Unpacks the homes of the package in a thread, while this one does something else."""
+    threading.Thread(target=_packaged, daemon=True).start()
 
 
 @functools.lru_cache(maxsize=1)

@@ -13,6 +13,7 @@ import filelock
 import torch
 
 from megastep import cache
+from megastep.agents.networks import fused
 from megastep.engine import operations, rendering
 from megastep.kernels.build import compile
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
@@ -172,6 +173,7 @@ class CudaOnCpu:
     def install(self, monkeypatch):
         """Replaces `launch` in all modules that import it."""
         self.launched.clear()
+        monkeypatch.setattr(fused, "uses_gpu", lambda: True)
         for module in operations, rendering:
             monkeypatch.setattr(module, "n_resident_threads", lambda *_: RESIDENT_THREADS)
         for path, module in list(sys.modules.items()):

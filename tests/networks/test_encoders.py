@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from megastep import spaces
 from megastep.agents.networks import convolutions as kernels
-from megastep.agents.networks import heads
+from megastep.agents.networks import fused, heads
 from megastep.agents.networks.linear import ComputeDtype
 from megastep.arrdict import arrdict
 
@@ -77,6 +77,7 @@ def test_an_intake_writes_features_side_by_side(space, n_calls, monkeypatch):
 
     monkeypatch.setattr(kernels, "conv_forward", conv_forward)
     monkeypatch.setattr(kernels, "conv_backward", torch.enable_grad()(gradients))
+    monkeypatch.setattr(fused, "uses_gpu", lambda: True)
     for is_supported in (True, False):
         monkeypatch.setattr(kernels, "takes", lambda rows, value=is_supported: value)
         with ComputeDtype("cpu", BF16):

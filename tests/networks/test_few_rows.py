@@ -87,6 +87,7 @@ def check_step(results, inputs, is_residual):
 
 def test_kernels_take_few_rows_of_whole_words(cuda_on_cpu, monkeypatch):
     capability = [9, 0]
+    cuda_on_cpu.install(monkeypatch)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: tuple(capability))
 
     def takes(*matrices):

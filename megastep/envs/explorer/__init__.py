@@ -68,7 +68,8 @@ def texel_runs(scenery: Scenery, visible: torch.Tensor) -> TexelRuns:
     bits = visible[layout, word] & of_wall
     middle = (0.5 * (begin + stop).float() - first.float()) / (end - first).float()
     places = lines[:, 0] + middle[:, None] * (lines[:, 1] - lines[:, 0])
-    indices = torch.stack([word, _as_signed(bits)], 1).int()
+    signed = bits - (bits >> 31 << 32)  # as int32 numbers of the same bits
+    indices = torch.stack([word, signed], 1).int()
     table = torch.cat([places, indices.view(torch.float32)], 1)[bits != 0]
     n_runs = layout[bits != 0].bincount(minlength=len(layouts))
     n_visible = torch.zeros(len(layouts), dtype=torch.int64)
@@ -79,11 +80,6 @@ def texel_runs(scenery: Scenery, visible: torch.Tensor) -> TexelRuns:
         tensor.to(device) for tensor in (table.contiguous(), starts.int(), n_visible.int())
     )
     return TexelRuns(runs, starts, n_visible, len(table))
-
-
-def _as_signed(bits) -> torch.Tensor:
-    """Returns numbers below 2**32 as the int32 numbers of the same bits."""
-    return bits - (bits >> 31 << 32)
 
 
 class Explorer(FirstPerson):
