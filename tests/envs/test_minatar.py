@@ -1,0 +1,187 @@
+"""MinAtar: equal to the original, which draws our random numbers, in every observation, reward and
+end.
+"""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._pytree import tree_leaves as leaves
+
+from megastep import envs
+from megastep.arrdict import arrdict
+from megastep.envs.minatar import ACTIONS
+from tests.helpers.pong_twins import philox
+
+every_game = pytest.mark.parametrize("game", ACTIONS)
+
+
+class OurDraws:
+    """Takes the place of the original's NumPy generator: an environment's draws, in order."""
+
+    def __init__(self, lane, seed):
+        self.lane, self.seed, self.n_drawn = lane, seed, 0
+
+    def word(self):
+        self.n_drawn += 1
+        return philox(self.lane, self.n_drawn - 1, self.seed)[0]
+
+    def rand(self, size=None):
+        draws = [(self.word() + 0.5) / 2**32 for _ in range(size or 1)]
+        return draws[0] if size is None else np.array(draws)
+
+    def randint(self, low, high=None, size=None):
+        low, high = (0, low) if high is None else (low, high)
+        draws = [low + (self.word() * (high - low) >> 32) for _ in range(size or 1)]
+        return draws[0] if size is None else np.array(draws)
+
+
+def original(game, **words):
+    logging.disable(logging.WARNING)  # that it cannot draw
+    try:
+        environment = pytest.importorskip("minatar.environment")
+    finally:
+        logging.disable(logging.NOTSET)
+    return environment.Environment(game, **words)
+
+
+def state_of(env):
+    return [leaf for leaf in (env.games, env.lists, env.images) if leaf is not None]
+
+
+def best_of(env, plans):
+    """Returns the first actions (N, 1) of the plans (K, T, N, 1) that earn most and survive."""
+    before, scores = [leaf.clone() for leaf in state_of(env)], []
+    for plan in plans:
+        score, alive = torch.zeros(env.n_envs), torch.ones(env.n_envs)
+        for actions in plan:
+            world = env.step(arrdict(actions=actions))
+            score += alive * (world.reward - 100.0 * world.terminal)
+            alive *= ~(world.terminal | world.truncated)
+        if world.obs.shape[2] == 10:  # divers on board, so that six are brought up in Seaquest
+            score += alive * world.obs[:, 0, 8].flatten(1).sum(1)
+        scores.append(score)
+        for leaf, old in zip(state_of(env), before):
+            leaf.copy_(old)
+    best = torch.stack(scores).argmax(0)
+    return plans[best, 0, torch.arange(env.n_envs)]
+
+
+def play(game, n_envs, n_episodes, seed, n_plans=0, **settings):
+    """Compares n_episodes in each lane. Lanes act at random; with plans, odd lanes take the best of
+    some random plans of 21 steps and of those to repeat an action. Returns how many episodes and
+    steps were compared, and the best return.
+    """
+    ours = envs.MinAtar(n_envs, id=game, seed=seed, device="cpu", **settings)
+    words = dict(sticky_action_prob=settings.get("sticky", 0.1))
+    words |= dict(difficulty_ramping=settings.get("ramping", True))
+    theirs = [original(game, **words) for _ in range(n_envs)]
+    numbers = theirs[0].minimal_action_set()
+    for e, env in enumerate(theirs):
+        env.random = env.env.random = OurDraws(e, seed)
+    random = torch.Generator().manual_seed(seed)
+    is_careful = torch.arange(n_envs)[:, None] % 2 == 1
+    always = torch.arange(len(numbers)).view(-1, 1, 1, 1).expand(-1, 7, n_envs, 1)
+    has_ended, returns = np.ones(n_envs, bool), np.zeros(n_envs)
+    n_ended, n_steps, best = np.zeros(n_envs, int), 0, 0
+    world = ours.reset()
+    actions = ours.no_actions
+    while n_ended.min() < n_episodes:
+        rewards, dones = np.zeros(n_envs), np.zeros(n_envs, bool)
+        for e, env in enumerate(theirs):
+            if has_ended[e]:
+                env.reset()
+            else:
+                rewards[e], dones[e] = env.act(numbers[int(actions[e])])
+        states = np.stack([env.state() for env in theirs])
+        assert np.array_equal(world.obs[:, 0].permute(0, 2, 3, 1).numpy(), states)
+        assert np.array_equal(world.reward.numpy(), rewards)
+        assert np.array_equal(world.terminal.numpy(), dones)
+        assert np.array_equal(world.reset.numpy(), has_ended)
+        n_steps += int((~has_ended).sum())
+        returns = np.where(has_ended, 0, returns + rewards)
+        best = max(best, returns.max())
+        has_ended = (world.terminal | world.truncated).numpy()
+        n_ended += has_ended
+        plans = torch.randint(len(numbers), (n_plans or 1, 7, n_envs, 1), generator=random)
+        actions = plans[0, 0]
+        if n_plans:
+            plans = torch.cat([plans, always]).repeat_interleave(3, 1)
+            actions = torch.where(is_careful, best_of(ours, plans), actions)
+        world = ours.step(arrdict(actions=actions))
+    return int(n_ended.sum()), n_steps, int(best)
+
+
+@every_game
+def test_equals_the_original(game):
+    play(game, n_envs=24, n_episodes=1, seed=3, limit=200)
+
+
+def test_equals_the_original_without_sticky_actions_and_ramping(game="asterix"):
+    play(game, n_envs=8, n_episodes=1, seed=5, limit=300, sticky=0, ramping=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("game", ["seaquest", "space_invaders"])
+def test_equals_the_original_when_played_well(game):
+    play(game, n_envs=16, n_episodes=1, seed=3, n_plans=2, limit=100)
+
+
+@pytest.mark.nightly
+@every_game
+def test_equals_the_original_for_a_thousand_episodes(game):
+    print(game, *play(game, n_envs=1000, n_episodes=1, seed=7, n_plans=2))
+
+
+@pytest.mark.cuda
+@every_game
+def test_gpu_has_the_bits_of_the_cpu(game):
+    worlds = []
+    actions = torch.randint(3, (400, 300, 1), generator=torch.Generator().manual_seed(1))
+    for device in "cpu", "cuda":
+        env = envs.MinAtar(300, id=game, device=device)
+        env.reset()
+        worlds.append([env.step(arrdict(actions=a.to(device))).clone() for a in actions])
+        worlds[-1].append(arrdict(dict(enumerate(state_of(env)))))
+    for ours, theirs in zip(*worlds, strict=True):
+        assert all((a == b.cpu()).all() for a, b in zip(leaves(ours), leaves(theirs), strict=True))
+
+
+@pytest.mark.parametrize("version, n_actions", [("v0", 6), ("v1", 4)])
+def test_registered_ids(version, n_actions):
+    """With the same seed, both do the same where their actions mean the same."""
+    env = envs.MinAtar(2, id=f"MinAtar/SpaceInvaders-{version}", device="cpu")
+    twin = envs.MinAtar(2, id="space_invaders", device="cpu")
+    assert env.action_space.n_actions == n_actions
+    env.reset()
+    twin.reset()
+    for move in "ArrowLeft", " ", "ArrowRight", " ":
+        world, other = (
+            one.step(arrdict(actions=torch.full((2, 1), one.controls[move]))) for one in (env, twin)
+        )
+        assert torch.equal(world.obs, other.obs)
+
+
+def test_an_unknown_id_names_the_nearest():
+    with pytest.raises(ValueError, match="near are .*MinAtar/Breakout-v1"):
+        envs.MinAtar(2, id="MinAtar/Breakout-v2", device="cpu")
+
+
+@every_game
+@pytest.mark.parametrize("value", [-(2**31), -1, 2**31 - 1])
+def test_what_is_written_into_games_ends_no_process(game, value, device):
+    env = envs.MinAtar(2, id=game, device=device)
+    env.reset()
+    for leaf in (env.games, env.lists):
+        for row in range(0 if leaf is None else len(leaf)):
+            leaf[row] = value
+            env.step(arrdict(actions=torch.full((2, 1), 1, device=device)))
+
+
+@every_game
+def test_picture(game, tmp_path):
+    env = envs.MinAtar(1, id=game, device="cpu")
+    env.reset()
+    env.display().savefig(tmp_path / "board.png")
+    assert (tmp_path / "board.png").stat().st_size > 2000
