@@ -191,6 +191,20 @@ function drawPong(game, context, width, height) {
   context.fillText(`${state[8]} : ${state[9]}`, 20 * scale, 2 * scale);
 }
 
+// Draws boards of cells that hold 0 or 1 in several channels, the first player's: megastep/envs/minatar.
+function drawMinAtar(game, context, width, height) {
+  const { colours, world: { obs: [, , [, , , rows, columns]] } } = game.data, [{ simulation, lane }] = game.players;
+  const scale = Math.min(width / (columns + 1), height / (rows + 1)), size = rows * columns;
+  context.translate((width - columns * scale) / 2, (height - rows * scale) / 2);
+  context.fillStyle = css("--floor");
+  context.fillRect(0, 0, columns * scale, rows * scale);
+  simulation.world("obs", lane).forEach((value, i) => {
+    if (!value) return;
+    context.fillStyle = colours[Math.floor(i / size) % colours.length];
+    context.fillRect(i % columns * scale, Math.floor(i % size / columns) * scale, scale, scale);
+  });
+}
+
 // Draws rows of [red, green, blue] from 0 to 255 as pixels.
 function drawPixels(canvas, rows) {
   Object.assign(canvas, { width: rows[0].length, height: rows.length });
@@ -206,7 +220,7 @@ function drawPlayer({ simulation, lane, own, isHuman, element, name, score, numb
     if (width === undefined) texts.push(` · ${path.slice(4) || "sees"} ${values.map(x => x.toFixed(2)).join(" ")}`);
     else drawPixels(canvases.shift(), Array.from({ length: height }, (_, y) => Array.from({ length: width }, (_, x) => (
       [0, 1, 2].map(c => values[(Math.min(c, n - 1) * height + y) * width + x]).map(value => (
-        dtype === "uint8" ? value : n === 1 ? 255 * value : encode(value)))))));
+        dtype === "uint8" ? (simulation.data.env === "MinAtar" ? 255 : 1) * value : n === 1 ? 255 * value : encode(value)))))));
   }
   const unit = x => [128 + 120 * Math.tanh(x), 128, 128 - 120 * Math.tanh(x)];
   const states = isHuman || !own ? [] : own.states.map(leaf => simulation.leaf(leaf, lane - own.lanes[0]).map(unit));
@@ -296,6 +310,7 @@ async function main() {
     const context = canvas.getContext("2d"), last = episodes.at(-1);
     context.scale(ratio, ratio);
     if (data.rooms) drawPlan(game, context, width, height, ratio);
+    else if (data.env === "MinAtar") drawMinAtar(game, context, width, height);
     else if (game.running[0].word("games")) drawPong(game, context, width, height);
     game.players.forEach(drawPlayer);
     Object.assign(context, { font: "600 14px system-ui, sans-serif", textAlign: "left" });

@@ -23,6 +23,7 @@ ENVS = dict.fromkeys(("explorer", "pointgoal", "memory", "keys"), SEEING) | dict
     deathmatch=dict(**SEEING, n_agents=3, hearing=5.0, search_reward=1.0, aim_reward=1.0),
     minimal={},
     pong=dict(pixels=True, self_play=True),
+    minatar=dict(id="seaquest"),
 )
 #: Floats whose memory holds integers too.
 RECORDS = ".all.records", ".runs.runs"
@@ -55,7 +56,7 @@ def use(env, is_cuda):
 
 
 def attack(name, device):
-    geometry = {} if name == "pong" else dict(geometries=sample("homes", 2))
+    geometry = {} if name in ("pong", "minatar") else dict(geometries=sample("homes", 2))
     env = envs.ENVS[name](2, **geometry, **ENVS[name], device=device)
     env.reset()
     leaves = [leaf for _, _, leaf in walk(env, torch.Tensor, only_state=False).values()]

@@ -55,6 +55,7 @@ SHORT = {
     "pointgoal, robot that slides": dict(
         limit=15, res=1, subsample=1, robot=Robot(sensor="rgb", speed=9.0, accel=90.0), slide=True
     ),
+    "minatar": dict(id="seaquest", limit=20),
     "pong": dict(limit=20),
     "pong, pixels": dict(limit=20, pixels=True),
     "pong, self-play": dict(limit=20, self_play=True),
@@ -74,7 +75,7 @@ MOST = chosen(
     (
         *("minimal", "explorer, privileged", "explorer, continuous", "explorer, cameras"),
         *("memory, privileged", "keys, privileged", "deathmatch, privileged"),
-        *("pointgoal, continuous", "pong, pixels of both"),
+        *("pointgoal, continuous", "pong, pixels of both", "minatar"),
     )
 )
 

@@ -27,6 +27,7 @@ ENVS = {
     "pointgoal": lambda: envs.PointGoal(6, homes(), device="cpu", privileged=True),
     "deathmatch": lambda: envs.Deathmatch(6, homes(), n_agents=2, device="cpu", privileged=True),
     "pong": lambda: envs.Pong(6, device="cpu", self_play=True),
+    "minatar": lambda: envs.MinAtar(6, device="cpu"),
 }
 
 
