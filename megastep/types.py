@@ -107,6 +107,7 @@ DEFAULTS: dict[str, Any] = {
     "privileged_space": None,
     "desync": None,
     "game_over": None,
+    "truth": None,  # a method: what no agent observes, (B, ...) by name, for datasets
     # of environments with opponents
     "learners": None,  # (B,) bool, lanes whose transitions are stored; None: all
     "matchups": {},  # (B,) bool by name, groups of lanes that are reported apart

@@ -39,6 +39,7 @@ SIMULATOR = (
     ("geodesics",),
     ("compat", "envs", "web", "wrappers"),
     ("adapters", "demo"),
+    ("data",),
 )
 ENGINE = (
     ("checks", "state_tree"),
@@ -72,6 +73,8 @@ SHARED = {
     "megastep.atomic_files",
     "megastep.capture",
     "megastep.coefficients",
+    "megastep.data",
+    "megastep.data.episodes",
     "megastep.dotdict",
     "megastep.env_state",
     "megastep.imports",
@@ -96,6 +99,7 @@ UPPER_ROOMS += ("pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",
+    "megastep.data.formats",
     "megastep.devices",
     "megastep.engine",
     "megastep.geometries.checks",
@@ -143,6 +147,7 @@ OUTSIDE_USERS = {
     "cuda": ("megastep/kernels/build/compile.py",),
     "gymnasium": (
         "megastep/adapters/*.py",
+        "megastep/data/formats.py",
         "megastep/envs/gymnasium.py",
         "megastep/envs/pettingzoo.py",
         "megastep/hosting/*.py",
@@ -156,9 +161,12 @@ OUTSIDE_USERS = {
         "megastep/hosting/processes.py",
         "megastep/workers.py",
     ),
+    "minari": ("megastep/data/formats.py",),
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/evaluation/ratings.py",),
     "pettingzoo": ("megastep/adapters/parallel_env.py", "megastep/hosting/hosted.py"),
+    "pandas": ("megastep/data/formats.py",),
+    "pyarrow": ("megastep/data/formats.py",),
     "rich": ("agents/console.py", "megastep/envs/pointgoal/goals.py"),
     "rsl_rl": ("megastep/adapters/rsl_rl.py",),
     "shapely": ("megastep/geometries/plans/*.py",),

@@ -13,6 +13,7 @@ COMMANDS = {
     "train": "trains a policy; --help says more",
     "evaluate": "measures a trained policy; --help says more",
     "record": "films a trained policy; --help says more",
+    "dump": "writes episodes as a dataset: npz, Minari, LeRobot; --help says more",
     "report": "writes a page about a run or several: curves, evaluations, homes; --help says more",
     "compare": "draws a metric of several runs, averaged over seeds; --help says more",
     "web": "writes a page that plays an agent in a browser; --help says more",

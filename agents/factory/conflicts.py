@@ -11,7 +11,7 @@ from megastep.schedules import Scheduled
 from megastep.settings import AtMost, closest
 
 if TYPE_CHECKING:
-    from megastep.agents.factory.settings import Env, Learner, Record, Train
+    from megastep.agents.factory.settings import Dump, Env, Learner, Record, Train
 
 #: Endings of what record.py can write.
 FILMS = ".mp4", ".gif", ".png", ".svg", ".pdf"
@@ -72,6 +72,14 @@ def of_recording(cfg: "Record") -> Iterator[tuple[str, str]]:
         yield "file", f"{cfg.file!r} {text}"
     if cfg.against is not None and cfg.run is None:
         yield "against", "needs run=, the agent that plays against it"
+
+
+def of_dumping(cfg: "Dump") -> Iterator[tuple[str, str]]:
+    """Yields what is wrong with the settings of a dataset."""
+    if (cfg.run is None) == (cfg.bot is None):
+        yield "run", "or bot= is needed, one of both: who plays"
+    elif cfg.bot is not None and cfg.env is None:
+        yield "env", f"is missing; bot={cfg.bot} env=explorer says where the bot plays"
 
 
 def _fields(cfg: "Train") -> Iterator[tuple[str, Any, Any]]:

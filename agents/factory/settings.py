@@ -267,6 +267,12 @@ def _given(run: T | None) -> T:
     return run
 
 
+def _folder(folder: T | None) -> T:
+    if folder is None:
+        raise ValueError("is missing; folder=FOLDER is a new folder for the dataset")
+    return folder
+
+
 @frozen
 class Evaluate(Played):
     run: Annotated[str, BeforeValidator(_given)]
@@ -275,6 +281,20 @@ class Evaluate(Played):
     baseline: Annotated[tuple[str, ...], BeforeValidator(_players)]
     against: Names | None = None
     ratings: bool = False
+
+
+@frozen
+class Dump(Played):
+    run: str | None
+    bot: str | None
+    episodes: Annotated[int, Field(ge=1, le=10_000_000)]
+    max_steps: Steps | None = None  # None: the environment's own limit
+    format: Literal["npz", "minari", "lerobot"] = "npz"
+    folder: Annotated[str, BeforeValidator(_folder)]
+    truth: bool = False
+
+    def conflicts(self) -> Iterator[tuple[str, str]]:
+        return conflicts.of_dumping(self)
 
 
 Home = Annotated[int, Field(ge=0, le=1_000_000)]

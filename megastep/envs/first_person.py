@@ -171,6 +171,36 @@ class FirstPerson(SceneryEnv):
         core = core or self.core
         return engine.observe(core.scenery, core.agents, self.subsample, imu=True, **seen)
 
+    def truth(self) -> arrdict:
+        """Returns what no agent observes, (B, ...) float32: ``agent_pos`` (2), metres;
+        ``agent_dir`` (2), the unit vector ahead; with objects ``targets_pos`` (K, 2), metres, and
+        ``targets_vec`` (K, 2), metres ahead and to the left. Games with a goal add ``target_pos``
+        and ``target_vec``.
+        """
+        agents, objects = self.core.agents, self.core.scenery.objects
+        angles = torch.deg2rad(agents.angles.flatten())
+        found = arrdict(
+            agent_pos=agents.positions.flatten(0, 1).clone(),
+            agent_dir=torch.stack([angles.cos(), angles.sin()], -1),
+        )
+        if objects is not None:
+            places = objects.positions.repeat_interleave(self.n_agents, 0)
+            ahead = self._ahead(found, places)
+            found = arrdict(found, targets_pos=places, targets_vec=ahead)
+        return found
+
+    @staticmethod
+    def _ahead(found: Mapping, places: torch.Tensor) -> torch.Tensor:
+        """Returns metres ahead and to the left of agents, (B, ..., 2), to places (B, ..., 2)."""
+        shape = len(places), *[1] * (places.ndim - 2), 2
+        x, y = found["agent_dir"].view(shape).unbind(-1)
+        dx, dy = (places - found["agent_pos"].view(shape)).unbind(-1)
+        return torch.stack([dx * x + dy * y, dy * x - dx * y], -1)
+
+    def _with_target(self, found: arrdict, places: torch.Tensor) -> arrdict:
+        """Adds the place (B, 2) that each agent is to reach."""
+        return arrdict(found, target_pos=places, target_vec=self._ahead(found, places))
+
     def _seen_by(self, e: int) -> arrdict:
         """Returns the observations of environment ``e``'s agents, (A, ...)."""
         return images(self._view(self.core.alone(e))).map(lambda leaf: leaf.squeeze(1))

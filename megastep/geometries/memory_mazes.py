@@ -129,7 +129,8 @@ def floor_plan(seed: int, size: int) -> tuple[np.ndarray, list[tuple[int, int, i
 
 def generate(seed: int, size: int = 9, cell: float = 0.6) -> dotdict:
     """Returns the maze of a seed: a geometry whose rooms are the maze's, without corridors. So
-    agents spawn in rooms. A cell is rounded to a millimetre. Raises ValueError for a size that is
+    agents spawn in rooms. A cell is rounded to a millimetre. `floor` (size, size) bool tells cells
+    of `cell` metres apart, the first at (`corner`, `corner`). Raises ValueError for a size that is
     none of `KINDS`.
     """
     if size not in KINDS:
@@ -158,4 +159,7 @@ def generate(seed: int, size: int = 9, cell: float = 0.6) -> dotdict:
         lights=((lines[1] + side * (lit + 0.5)) / 1000).astype(np.float32),
         masks=geometry.masks(walls, polygons),
         res=geometry.RES,
+        floor=floor,
+        cell=side / 1000,
+        corner=lines[1] / 1000,
     )

@@ -164,6 +164,11 @@ class Memory(FirstPerson):
             reach=REACH,
         )
 
+    def truth(self) -> arrdict:
+        """As of :class:`FirstPerson`; the target is the object to find."""
+        cue = self.cue.long()[:, None, None].expand(-1, 1, 2)
+        return self._with_target(super().truth(), self.objects.all.positions.gather(1, cue)[:, 0])
+
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""
         return arrdict(

@@ -155,6 +155,11 @@ class PointGoal(FirstPerson):
             n_spawns=self.goals.lengths.shape[1],
         )
 
+    def truth(self) -> arrdict:
+        """As of :class:`FirstPerson`; the target is the goal."""
+        goals = self.goals.points[self.layout.long(), self.goal_index.long()]
+        return self._with_target(super().truth(), goals)
+
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""
         layout, goal = self.layout[e].long(), self.goal_index[e].long()

@@ -1,0 +1,349 @@
+"""Writes episodes of an agent as a dataset. B lanes, T steps.
+
+Episodes are played in waves, one per lane, each from seeds of its own. So a dump that was stopped
+goes on with the first wave that is not complete, and memory holds three waves at most.
+"""
+
+import concurrent.futures
+import contextlib
+import errno
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from megastep import data, spaces
+from megastep.agents import console, factory
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.evaluation import eval_env
+from megastep.agents.factory import check, components, env_failures, settings
+from megastep.agents.generator import SeededGenerator, stream_seed
+from megastep.agents.runs import checkpoint, folders, restore
+from megastep.agents.storage.collector import Collector
+from megastep.agents.storage.rollout import Rollout, copy_tree
+from megastep.arrdict import arrdict
+from megastep.atomic_files import delete, write_atomically
+from megastep.data import episodes, formats
+from megastep.types import Env, PolicyLike, Tree, optional, takes_masks
+
+#: Lanes that play at once.
+LANES = 1024
+#: Steps that are copied from the device at once.
+STEPS = 64
+#: Threads that write files.
+WRITERS = min(16, os.cpu_count() or 1)
+#: Folder of the episodes of a dataset in another format, until they are converted.
+STAGED = "episodes"
+
+
+def run(cfg: settings.Dump) -> Path:
+    """Writes a dataset, or what is missing of it. Returns its folder.
+
+    Raises:
+        UserError: the folder has other files, or the disk is too small; nothing is half-written.
+    """
+    start, folder, device = time.monotonic(), Path(cfg.folder), factory.make_device(cfg.device)
+    if cfg.format != "npz":
+        with user_errors(kinds=(data.DatasetError,)):
+            formats.require(cfg.format)
+    loaded, env_settings, geometry = None, cfg.env, cfg.geometry
+    if cfg.run is not None:
+        loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
+        trained = factory.config_of(loaded)
+        env_settings = cfg.env or trained.env
+        geometry = factory.typed_or(trained.geometry, geometry, env_settings)
+    env_settings = cast("settings.Env", env_settings)
+    geometry = geometry or components.settings_for("geometry", components.HOMES)
+    homes = factory.homes(env_settings, geometry, cfg.split)
+    env_settings = settings.changed_known(env_settings, resample=True)
+    with env_failures.caught(env_settings, Path()):
+        waves = Waves(cfg, env_settings, homes, loaded, device)
+        about = waves.about(cfg, env_settings, geometry, loaded)
+        _claim(folder, about)
+        staged = folder if cfg.format == "npz" else folder / STAGED
+        with folders.locked(folder), _tidied(folder, staged):
+            if cfg.format == "npz" or not formats.is_there(cfg.format, folder):
+                staged.mkdir(exist_ok=True)
+                waves.write(staged)
+                if cfg.format != "npz":
+                    write_atomically(staged / data.ABOUT, _text({**about, "format": "npz"}))
+                    formats.convert(cfg.format, data.load(staged), folder, console.count)
+            if cfg.format != "npz":
+                delete(staged)
+    console.say(
+        f"{cfg.episodes:,} episodes are in {folder}; {waves.n_steps:,} steps of them were written "
+        f"in {console.duration(time.monotonic() - start)}"
+    )
+    return folder
+
+
+def _text(about) -> bytes:
+    return json.dumps(about, indent=1).encode()
+
+
+def _claim(folder, about) -> None:
+    """Makes the folder of a dataset. UserError if it has other files or another dataset."""
+    with user_errors(folders.CANNOT.format(folder)):
+        if not folder.exists() or not any(folder.iterdir()):
+            folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(folder / data.ABOUT, _text(about))
+            return
+    if not (folder / data.ABOUT).exists():
+        raise UserError(f"{folder} has other files; choose a new folder")
+    with user_errors(kinds=(data.DatasetError,)):
+        old = data.about(folder)
+    about = json.loads(_text(about))  # as JSON has it
+    old, new = (dict(check.leaves({k: v for k, v in one.items()})) for one in (old, about))
+    if changed := [key for key in {**old, **new} if old.get(key) != new.get(key)]:
+        key = changed[0]
+        raise UserError(
+            f"{folder} has another dataset: its {key} is {old.get(key)} and not {new.get(key)}; "
+            "choose a new folder, or repeat the words of that dump"
+        )
+
+
+@contextlib.contextmanager
+def _tidied(folder, staged) -> Iterator[None]:
+    """Removes a dataset of no episode after an error. An OSError becomes a UserError."""
+    try:
+        yield
+    except (OSError, UserError) as error:
+        if not (is_begun := any(staged.glob("episode-*.npz"))):
+            for path in staged, folder / data.ABOUT:
+                delete(path)
+        if isinstance(error, UserError):
+            raise
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        cure = "repeat the command to go on" if is_begun else "repeat the command"
+        problem = "the disk is full: make room" if full else f"{error}: choose another folder"
+        raise UserError(f"{folder} cannot be written, as {problem}, and {cure}") from error
+
+
+class _Told:
+    """An environment whose observations are `seen`, what agents see, and, if told, `truth`."""
+
+    def __init__(self, env: Env, is_told: bool):
+        self.env, self.truth = env, optional(env, "truth") if is_told else dict
+        if self.truth is None:
+            raise UserError(f"truth=true: {type(env).__name__} has no method truth(); leave it out")
+        truth = self._told(env.reset())["obs"]["truth"]
+        self.shapes = {name: tuple(leaf.shape[1:]) for name, leaf in self.truth().items()}
+        space = {k: spaces.MultiVector(*v.shape[1:], dtype=torch.float32) for k, v in truth.items()}
+        self.obs_space = dict(seen=env.obs_space, truth=space)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def reset(self, **options) -> arrdict:
+        return self._told(self.env.reset(**options))
+
+    def step(self, decision) -> arrdict:
+        return self._told(self.env.step(decision))
+
+    def _told(self, world) -> arrdict:
+        truth = {name: leaf.float().flatten(1)[:, None] for name, leaf in self.truth().items()}
+        return arrdict(world, obs=arrdict(seen=world["obs"], truth=arrdict(truth)))
+
+
+class _Actor:
+    """A policy that sees what it should of `_Told` worlds, and whose draws have a seed."""
+
+    def __init__(self, policy: PolicyLike, greedy: bool):
+        self.policy, self.greedy, self.draws = policy, greedy, SeededGenerator(1)
+        self.initial = policy.initial
+        self.compute_dtype = getattr(policy, "compute_dtype", contextlib.nullcontext)
+
+    def __call__(self, world, state, **_) -> tuple[Any, Tree]:
+        world = arrdict(world, obs=world["obs"]["seen"])
+        generator = self.draws.on(world["reset"].device)
+        return self.policy(world, state, sample=not self.greedy, generator=generator)
+
+
+class Waves:
+    """Plays and writes the episodes of a dump.
+
+    Attributes:
+        n_steps: steps written so far.
+    """
+
+    def __init__(
+        self,
+        cfg: settings.Dump,
+        env: settings.Env,
+        homes: list[dict],
+        loaded: checkpoint.Checkpoint | None,
+        device: torch.device,
+    ):
+        self.cfg, self.loaded, self.n_steps = cfg, loaded, 0
+        self.where: dict = dict(seed=cfg.seed, device=device)
+        sample = factory.make_sample(env, homes, **self.where)
+        n_agents = optional(sample, "n_agents")
+        n_envs = -(-min(cfg.episodes, LANES) // n_agents)
+        self.settings = settings.changed(env, n_envs=n_envs)
+        is_drawn = getattr(env, "resample", False)
+        self.homes = homes if is_drawn else factory.spread(homes, n_envs)
+        tree = {"obs": sample.obs_space, "actions": sample.action_space}
+        with factory.errors():
+            texts = {name: repr(space) for name, space in spaces.leaves(tree).items()}
+            self.codec = episodes.Codec(texts)
+        self.n_lanes, self.n_agents = n_envs * n_agents, n_agents
+        self.most = cfg.max_steps or optional(sample, "max_episode_steps")
+        self.fps, self._make = optional(sample, "fps"), lambda: self._made(sample)
+        self.told: _Told | None = None
+
+    def about(self, cfg, env, geometry, loaded) -> dict[str, Any]:
+        """Returns what the dataset's file says."""
+        names = "episodes", "seed", "split", "greedy", "max_steps", "truth"
+        chosen = {name: getattr(cfg, name) for name in names}
+        chosen["player"] = cfg.bot if loaded is None else eval_env.name_of(loaded)
+        chosen |= dict(env=check.as_tree(env), geometry=check.as_tree(geometry))
+        about = dict(writer=data.WRITER, format=cfg.format, fps=float(self.fps))
+        texts = {path: repr(space) for path, space in self.codec.spaces.items()}
+        return dict(about, spaces=texts, settings=chosen)
+
+    def _made(self, sample, seed=None) -> None:
+        """Makes the environment, who plays in it, and what collects."""
+        where = self.where if seed is None else self.where | {"seed": seed}
+        env = factory.construct(self.settings, geometries=self.homes, **where)
+        if self.loaded is not None:
+            policy: PolicyLike = restore.policy_of(self.loaded, env)
+            restore.load_wrappers(env, self.loaded)
+        else:
+            name = None if self.cfg.bot == "bot" else self.cfg.bot
+            policy = factory.make_bot(name, self.settings, sample)
+            policy = factory.in_env(policy, self.settings, env)
+        self.told, self.actor = _Told(env, self.cfg.truth), _Actor(policy, self.cfg.greedy)
+        state = self.actor.initial(self.n_lanes, env.device)
+        about = STEPS, self.n_lanes, self.told.obs_space, env.action_space, state, env.device
+        rollout = Rollout(*about, values=False)
+        self.collect = Collector(cast(Env, self.told), cast(Any, self.actor), rollout)
+
+    # ---- Playing ----
+
+    def _begin(self, wave) -> None:
+        """Begins episodes that depend on the seed and the wave's number alone."""
+        seed = stream_seed(self.cfg.seed, f"wave {wave}")
+        if self.told is None:
+            self._make()
+        assert self.told is not None
+        if takes_masks(self.told.env):
+            world = self.told.reset(seed=seed)
+        else:
+            if wave:
+                optional(self.told.env, "close")()
+                self._made(self.told.env, seed % 2**31)
+            world = self.told.reset()
+        device = world["reset"].device
+        start = self.collect.parts[-1]
+        kept = arrdict({key: world[key] for key in start.world})
+        copy_tree(start, arrdict(world=kept, state=self.actor.initial(self.n_lanes, device)))
+        self.actor.draws.on(device).manual_seed(stream_seed(seed, "actions"))
+
+    def play(self, wave: int) -> tuple[dict[str, torch.Tensor], np.ndarray, np.ndarray | None]:
+        """Plays a wave. Returns its arrays (B, T + 1, ...) on the CPU as they are stored, with rows
+        after an episode's end; how many steps each episode has, (B,); and its layout, (B,).
+        """
+        self._begin(wave)
+        assert self.told is not None
+        layout = optional(self.told.env, "layout")
+        layout = None if layout is None else layout.repeat_interleave(self.n_agents).cpu().numpy()
+        parts, lengths = [], np.zeros(self.n_lanes, np.int64)
+        while not lengths.all() and len(parts) * STEPS < self.most:
+            rollout = self.collect()
+            parts.append(self._part(rollout))
+            if torch.device(self.told.device).type == "cuda":
+                torch.cuda.current_stream().synchronize()
+            ends = (parts[-1]["terminal"] | parts[-1]["truncated"]).numpy()
+            first = len(parts) * STEPS - STEPS + ends.argmax(1) + 1
+            lengths = np.where((lengths == 0) & ends.any(1), first, lengths)
+        last, arrays = self._part(rollout, last=True), {}
+        for name in parts[0]:
+            rows = [part[name] for part in parts]
+            if name.startswith("action") or name in episodes.OUTCOMES:  # row t led to time t
+                arrays[name] = torch.cat([torch.zeros_like(rows[0][:, :1]), *rows], 1)
+            else:
+                arrays[name] = torch.cat([*rows, last[name]], 1)
+        is_cut = np.flatnonzero((lengths == 0) | (lengths > self.most))
+        lengths[is_cut] = self.most
+        arrays["truncated"][is_cut, self.most] = True
+        return arrays, lengths, layout
+
+    def _part(self, rollout, last=False) -> dict[str, torch.Tensor]:
+        """Returns a rollout's steps (B, T, ...), or its last observation (B, 1, ...), as they are
+        stored. On a GPU they are there once the stream has been waited for.
+        """
+        rows = slice(-1, None) if last else slice(None, -1)
+        found = {"obs": rollout.obs["seen"], "actions": rollout.actions}
+        leaves = spaces.leaves(found)
+        part = {}
+        for path, name in self.codec.names.items():
+            is_obs = path.startswith("obs")
+            part[name] = self.codec.encode(path, leaves[path][rows] if is_obs else leaves[path])
+        part |= {name: getattr(rollout, name) for name in ("reward", "terminal", "truncated")}
+        assert self.told is not None
+        for name, leaf in rollout.obs["truth"].items():
+            part[name] = leaf[rows].unflatten(-1, self.told.shapes[name])[:, :, 0]
+        if rollout.mask is not None:
+            masks = spaces.leaves(rollout.mask, "mask").items()
+            part |= {name: leaf[rows].squeeze(2) for name, leaf in masks}
+        return {
+            k: v.transpose(0, 1).contiguous().to("cpu", non_blocking=True) for k, v in part.items()
+        }
+
+    # ---- Writing ----
+
+    def write(self, folder: Path) -> None:
+        """Writes the episodes that are missing in a folder."""
+        for path in folder.glob("*.tmp"):
+            delete(path)
+        there, n = {path.name for path in folder.glob("episode-*.npz")}, self.cfg.episodes
+        pending: list[concurrent.futures.Future] = []
+        with concurrent.futures.ThreadPoolExecutor(WRITERS) as pool:
+            for wave, first in enumerate(range(0, n, self.n_lanes)):
+                lanes = range(min(self.n_lanes, n - first))
+                paths = {lane: folder / f"episode-{first + lane:06d}.npz" for lane in lanes}
+                missing = {lane: path for lane, path in paths.items() if path.name not in there}
+                if missing:
+                    played = self.play(wave)
+                    if not pending:
+                        self._check_room(folder, played, n - len(there))
+                    for task in pending:
+                        task.result()
+                    parts = np.array_split([*missing], WRITERS)
+                    pending = [
+                        pool.submit(self._write, played, {lane: missing[lane] for lane in part})
+                        for part in parts
+                    ]
+                console.count(first + len(lanes), n)
+            for task in pending:
+                task.result()
+
+    def _check_room(self, folder, played, n_missing) -> None:
+        arrays, lengths, _ = played
+        per_row = sum(leaf[0, 0].numel() * leaf.element_size() for leaf in arrays.values())
+        needed = n_missing * (per_row * (lengths.mean() + 1) + 4096)
+        free = shutil.disk_usage(folder).free
+        if needed > free:
+            raise UserError(
+                f"{n_missing:,} episodes need about {needed / 1e9:,.1f} GB, and the disk of "
+                f"{folder} has {free / 1e9:,.1f} GB left; write fewer (episodes=), or elsewhere"
+            )
+
+    def _write(self, played, paths) -> None:
+        tensors, lengths, layout = played
+        arrays = {name: leaf.numpy() for name, leaf in tensors.items()}
+        for lane, path in paths.items():
+            rows = int(lengths[lane]) + 1
+            one = {name: array[lane, :rows] for name, array in arrays.items()}
+            if self.cfg.truth and layout is not None and self.homes:
+                one = episodes.with_plan(one, self.homes[layout[lane]])
+            episodes.write(path, one)
+        self.n_steps += int(lengths[[*paths]].sum())

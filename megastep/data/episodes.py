@@ -1,0 +1,178 @@
+"""Episodes as arrays by name, and the npz files that hold one each. T steps, T + 1 rows.
+
+Row t has the observation at time t, and the action, reward and flags that led there, as in Memory
+Maze's offline set (Pasukonis et al. 2022). Row 0 of these is zeros.
+"""
+
+import functools
+import io
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from megastep import spaces
+from megastep.arrdict import arrdict
+from megastep.colour import gamma_decode, gamma_encode
+
+#: What Memory Maze's offline set calls observations of ours; all others keep their names.
+NAMES = {"rgb": "image", "cue": "target_color"}
+OUTCOMES = "reward", "terminal", "truncated"
+#: Names of what is no observation.
+RESERVED = "action", "mask", *OUTCOMES
+#: Names of floor plans, which all rows of an episode share.
+PLANS = "maze_layout", "walls"
+Arrays = dict[str, np.ndarray]
+
+
+@functools.cache
+def _to_srgb() -> torch.Tensor:
+    """Returns the 8-bit sRGB value of each float16 of linear light, by its bits."""
+    light = np.arange(2**16, dtype=np.uint16).view(np.float16).astype(np.float64)
+    light = np.nan_to_num(light, nan=0.0).clip(0, 1)
+    return torch.from_numpy(np.round(255 * gamma_encode(light)).astype(np.uint8))
+
+
+@functools.cache
+def _to_linear() -> torch.Tensor:
+    """Returns the linear light of each 8-bit sRGB value, float16."""
+    return torch.from_numpy(gamma_decode(np.arange(256) / 255).astype(np.float16))
+
+
+class Codec:
+    """Turns observations and actions of some spaces into arrays of files, and back.
+
+    Images in linear light are stored as `image` (T + 1, H, W, 3), 8-bit sRGB, which is read back
+    within 0.3 % of full light; all others to the bit. An axis of one agent is left out.
+
+    Args:
+        texts: the spaces of a dataset, as `{'obs.rgb': 'MultiImage(...)', 'actions': ...}`.
+    """
+
+    def __init__(self, texts: Mapping[str, str]):
+        self.spaces: dict[str, Any] = {path: spaces.from_text(one) for path, one in texts.items()}
+        self.names = {path: self._name(path) for path in self.spaces}
+        taken = [*self.names.values()]
+        if clash := [name for name in taken if taken.count(name) > 1]:
+            raise ValueError(f"two observations or actions would both be called {clash[0]}")
+
+    def _name(self, path) -> str:
+        kind, _, rest = path.partition(".")
+        if kind == "actions":
+            return "action" + (rest and f".{rest}")
+        known = NAMES.get(rest)
+        if known and not (known == "image" and not self._is_image(path)):
+            return known
+        return f"obs.{rest}" if rest in RESERVED or rest in PLANS or not rest else rest
+
+    def _is_image(self, path) -> bool:
+        space = self.spaces[path]
+        is_light = isinstance(space, spaces.MultiImage) and space.dtype in (None, torch.float16)
+        return is_light and space.C == 3 and space.n_agents == 1
+
+    def encode(self, path: str, leaf: torch.Tensor) -> torch.Tensor:
+        """Returns rows (..., *space.shape) as they are stored; integer actions one-hot, uint8."""
+        space = self.spaces[path]
+        n_axes = len(space.shape)
+        if path.startswith("actions") and isinstance(space, spaces.MultiDiscrete):
+            leaf = torch.nn.functional.one_hot(leaf.long(), space.n_actions).to(torch.uint8)
+            n_axes += 1
+        elif self.names[path] == "image":
+            codes = leaf.contiguous().view(torch.int16).int() & 0xFFFF
+            leaf = _to_srgb().to(leaf.device)[codes].movedim(-3, -1)
+        return leaf.squeeze(-n_axes) if space.n_agents == 1 else leaf
+
+    def decode(self, path: str, array: np.ndarray) -> torch.Tensor:
+        """The inverse of `encode`, of rows (T, ...); of an all-zero action, action 0."""
+        space, leaf = self.spaces[path], torch.from_numpy(np.ascontiguousarray(array))
+        if space.n_agents == 1:
+            leaf = leaf.unsqueeze(1)
+        if path.startswith("actions") and isinstance(space, spaces.MultiDiscrete):
+            return leaf.argmax(-1)
+        if self.names[path] == "image":
+            return _to_linear()[leaf.long()].movedim(-1, -3)
+        return leaf
+
+    def decoded(self, arrays: Mapping[str, np.ndarray]) -> arrdict:
+        """Returns an episode as tensors.
+
+        - obs: (T + 1, ...) per leaf of the observation space
+        - actions: (T, ...) per leaf of the action space
+        - reward: (T,) float32; terminal, truncated: (T,) bool
+        - the rest, such as `mask` and `agent_pos`: as stored, (T + 1, ...), or a floor plan
+        """
+        left = dict(arrays)
+        tree: dict[str, Any] = {}
+        for path, name in self.names.items():
+            array = left.pop(name)
+            leaf = self.decode(path, array[1:] if path.startswith("actions") else array)
+            *keys, last = path.split(".")
+            branch = tree
+            for key in keys:
+                branch = branch.setdefault(key, arrdict())
+            branch[last] = leaf
+        for name in OUTCOMES:
+            tree[name] = torch.from_numpy(left.pop(name)[1:].copy())
+        tree |= {name: torch.from_numpy(array) for name, array in left.items()}
+        return arrdict(tree)
+
+
+# ---- Files ----
+
+
+@functools.cache
+def _header(dtype, shape) -> bytes:
+    file = io.BytesIO()
+    fields = dict(descr=np.lib.format.dtype_to_descr(dtype), fortran_order=False, shape=shape)
+    np.lib.format.write_array_header_1_0(file, fields)
+    return file.getvalue()
+
+
+def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes an npz file, whole or not at all. Equal arrays give equal bytes. Floor plans are
+    compressed. OSError if it cannot be written.
+    """
+    temporary = path.with_suffix(".tmp")
+    try:
+        with zipfile.ZipFile(temporary, "w") as archive:
+            for name, array in arrays.items():
+                entry = zipfile.ZipInfo(f"{name}.npy")  # of 1980, and not of now
+                if name in PLANS:
+                    entry.compress_type = zipfile.ZIP_DEFLATED
+                array = np.ascontiguousarray(array)
+                data = b"".join((_header(array.dtype, array.shape), array.data.cast("B")))
+                archive.writestr(entry, data, compresslevel=1)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read(path: Path) -> Arrays:
+    """Returns the arrays of an npz file. OSError or ValueError if it is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (zipfile.BadZipFile, KeyError, EOFError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from None
+
+
+def with_plan(arrays: Arrays, home: Mapping[str, Any]) -> Arrays:
+    """Returns an episode with its floor plan: `walls` (M, 2, 2), metres. In mazes of cells also
+    `maze_layout` (T + 1, n, n), 1 where there is floor; places are in cells there, as those of
+    Memory Maze, and not in metres: (0, 0) is the corner of the first cell.
+    """
+    arrays = {**arrays, "walls": home["walls"]}
+    if "floor" not in home:
+        return arrays
+    for name, array in arrays.items():
+        if name.endswith("_pos"):
+            arrays[name] = ((array - home["corner"]) / home["cell"]).astype(np.float32)
+        elif name.endswith("_vec"):
+            arrays[name] = (array / home["cell"]).astype(np.float32)
+    rows, floor = len(arrays["reward"]), home["floor"].astype(np.uint8)
+    return arrays | {"maze_layout": np.broadcast_to(floor, (rows, *floor.shape))}
