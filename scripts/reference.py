@@ -37,7 +37,12 @@ from megastep.schedules import Scheduled
 from megastep.settings import BOUNDS, AtMost
 
 #: The dataclasses of the scripts' settings.
-SCRIPTS = {"train": settings.Train, "evaluate": settings.Evaluate, "record": settings.Record}
+SCRIPTS = {
+    "train": settings.Train,
+    "evaluate": settings.Evaluate,
+    "record": settings.Record,
+    "dump": settings.Dump,
+}
 #: Groups with one class of settings. The others have a class or function per member.
 SINGLE = {"agent": components.POLICY, "opponents": components.OPPONENTS}
 #: Settings that no docstring describes, since they are not arguments of the constructor.

@@ -272,8 +272,8 @@ class Waves:
             else:
                 arrays[name] = torch.cat([*rows, last[name]], 1)
         is_cut = np.flatnonzero((lengths == 0) | (lengths > self.most))
-        lengths[is_cut] = self.most
-        arrays["truncated"][is_cut, self.most] = True
+        lengths[is_cut] = end = min(self.most, STEPS * len(parts))
+        arrays["truncated"][is_cut, end] = True
         return arrays, lengths, layout
 
     def _part(self, rollout, last=False) -> dict[str, torch.Tensor]:
