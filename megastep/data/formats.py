@@ -3,6 +3,7 @@
 Both are made from a folder of npz files, an episode at a time, and appear once they are whole.
 """
 
+import importlib
 import importlib.util
 import io
 import json
@@ -74,9 +75,7 @@ def _parts(source, arrays) -> tuple[dict, dict, dict]:
 
 
 def _minari(source, folder, progress) -> None:
-    import minari
     from gymnasium.spaces import Box, Dict
-    from minari.data_collector import EpisodeBuffer
 
     from megastep.adapters.vector_env import gymnasium_space
 
@@ -92,17 +91,19 @@ def _minari(source, folder, progress) -> None:
         is_one_hot = isinstance(of_actions[name], spaces.MultiDiscrete)
         return array[1:].argmax(-1) if is_one_hot else array[1:]
 
-    def buffers() -> Iterator[EpisodeBuffer]:
+    minari: Any = importlib.import_module("minari")  # whose annotations take no arrays
+
+    def buffers() -> Iterator[Any]:
         for number, arrays in enumerate(_each(source, progress)):
             seen, actions, truth = _parts(source, arrays)
             actions = {name: actions_of(name, array) for name, array in actions.items()}
-            yield EpisodeBuffer(
+            yield minari.data_collector.EpisodeBuffer(
                 id=number,
                 observations=seen,
                 actions=actions if len(actions) > 1 else actions["action"],
-                rewards=arrays["reward"][1:],  # pyright: ignore[reportArgumentType]
-                terminations=arrays["terminal"][1:],  # pyright: ignore[reportArgumentType]
-                truncations=arrays["truncated"][1:],  # pyright: ignore[reportArgumentType]
+                rewards=arrays["reward"][1:],
+                terminations=arrays["terminal"][1:],
+                truncations=arrays["truncated"][1:],
                 infos=truth,
             )
 
@@ -112,7 +113,7 @@ def _minari(source, folder, progress) -> None:
         warnings.simplefilter("ignore")  # of authors, and of an environment that Gymnasium makes
         minari.create_dataset_from_buffers(
             f"{source.label}-v0",
-            buffers(),  # pyright: ignore[reportArgumentType]
+            buffers(),
             observation_space=Dict({name: obs_space(array) for name, array in first.items()}),
             action_space=Dict(each) if len(each) > 1 else each["action"],
             algorithm_name=source.about["settings"]["player"],
