@@ -139,7 +139,7 @@ def make(env: object, privileged: bool = False, **settings_of_env: object) -> "E
         settings_of_env: the environment's settings, and as on the command line `geometry`, `split`
             ("training" here), `seed` and `device`.
     """
-    from megastep.agents import factory  # with PyTorch
+    from megastep.agents.factory import make as factory  # with PyTorch
 
     arguments = {
         key if key.partition(".")[0] in OF_MAKE else f"env.{key}": value

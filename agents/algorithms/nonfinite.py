@@ -125,7 +125,7 @@ class NonFiniteCheck:
         # The rest describes the first rollout with non-finite numbers:
         # [2] its number, from 1; 0 if there is none
         # [3] how many of its lanes have a non-finite number
-        # [4] the index in `_sizes` of the first such number
+        # [4] the index in `sizes` of the first such number
         # [5] its magnitude: -1 for NaN, 1.8e308 for infinity
         self.record = torch.zeros(6, dtype=torch.float64, device=device)
 
@@ -139,7 +139,24 @@ class NonFiniteCheck:
         """
         count, first = self.record[:1], self.record[2:]
         count += 1
-        sizes = _sizes(floats)
+        # The largest magnitudes, ((T+1) F, B) for F tensors, NaN where there is a NaN. Rows are
+        # ordered by time, then by tensor. Row t of a tensor with T rows belongs to world t+1.
+        tensors = list(floats.values())
+        n_steps, n_lanes = min(map(len, tensors)), tensors[0].shape[1]
+        shape = n_steps + 1, len(tensors), n_lanes
+        sizes = tensors[0].new_zeros(shape, dtype=torch.float32)
+        for i, values in enumerate(tensors):
+            numbers = values
+            if values.dim() > 2:
+                numbers = values.flatten(2)
+                if torch.finfo(values.dtype).max < LIMIT:
+                    # float16 cannot hold numbers beyond LIMIT but inf, which a sum turns into inf
+                    # or NaN; sums are five times as fast as maxima
+                    numbers = numbers.sum(-1, dtype=torch.float32)
+                else:
+                    numbers = torch.maximum(numbers.amax(-1), -numbers.amin(-1))
+            sizes[-len(values) :, i] = numbers.abs()
+        sizes = sizes.flatten(0, 1)
         is_bad = ~(sizes <= LIMIT)
         n_bad = is_bad.any(0).sum(dtype=torch.float64)
         index = is_bad.flatten().byte().argmax()
@@ -176,28 +193,6 @@ class NonFiniteCheck:
         step = (int(rollout) - 1) * n_steps + row
         value = NonFiniteValue(list(floats)[i], lane, step, size, int(rollout), int(n_bad))
         return value, int(n_skipped)
-
-
-def _sizes(floats) -> torch.Tensor:
-    """Returns the largest magnitudes, ((T+1) F, B) for F tensors, NaN where there is a NaN.
-
-    Rows are ordered by time, then by tensor. Row t of a tensor with T rows belongs to world t+1.
-    """
-    tensors = list(floats.values())
-    n_steps, n_lanes = min(map(len, tensors)), tensors[0].shape[1]
-    sizes = tensors[0].new_zeros(n_steps + 1, len(tensors), n_lanes, dtype=torch.float32)
-    for i, values in enumerate(tensors):
-        numbers = values
-        if values.dim() > 2:
-            numbers = values.flatten(2)
-            if torch.finfo(values.dtype).max < LIMIT:
-                # float16 cannot hold numbers beyond LIMIT but inf, which a sum turns into inf or
-                # NaN; sums are five times as fast as maxima
-                numbers = numbers.sum(-1, dtype=torch.float32)
-            else:
-                numbers = torch.maximum(numbers.amax(-1), -numbers.amin(-1))
-        sizes[-len(values) :, i] = numbers.abs()
-    return sizes.flatten(0, 1)
 
 
 def lane_name(lane: int, n_agents: int) -> str:

@@ -16,7 +16,7 @@ from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalise
 from megastep.agents.networks.fused import fused
 from megastep.agents.networks.policy import Policy
-from megastep.agents.networks.running_norm import masked_moments, normalise_masked
+from megastep.agents.networks.running_norm import add_moments, masked_moments, normalise_masked
 from megastep.agents.storage.rollout import SEQUENCES, without_last
 from megastep.arrdict import arrdict
 from megastep.coefficients import on_device
@@ -194,7 +194,7 @@ class PPO(learner.ActorCritic):
                 self.steps.take(is_enabled)
         # Observation statistics change only now, so the whole update saw the normalisation that
         # acted.
-        self.policy.add_moments(of_obs, is_finite)
+        add_moments(self.policy.norms, of_obs, is_finite)
         return {**self.steps.end(), "explained_variance": explained}
 
     def _losses(self, rollout, lanes, batch) -> "tuple[torch.Tensor, dict[str, torch.Tensor]]":

@@ -20,7 +20,7 @@ from megastep.agents.algorithms.masked_stats import (
 )
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.policy import Policy
-from megastep.agents.networks.running_norm import masked_moments
+from megastep.agents.networks.running_norm import add_moments, masked_moments
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings, replay_size
 from megastep.agents.storage.rollout import without_last
@@ -137,7 +137,7 @@ class VTrace(learner.ActorCritic):
         own_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])
         of_targets, *of_obs = pool_moments(*masked_moments(valid, targets), *own_obs)
         self.critic.output.add(of_targets, is_finite)
-        self.policy.add_moments(of_obs, is_finite)
+        add_moments(self.policy.norms, of_obs, is_finite)
         return self.steps.end()
 
     def _batch(self, rollout, lanes) -> arrdict:

@@ -11,7 +11,7 @@ from megastep.agents.factory import check, settings
 from megastep.agents.factory.check import Tree
 from megastep.agents.launch import launcher
 from megastep.agents.launch.again import AUTO, RESUMABLE, automatic
-from megastep.agents.runs import agent_file, folders, populations
+from megastep.agents.runs import agent_file, folders, populations, trust
 
 HELP = """Trains a policy in an environment.
 
@@ -93,7 +93,9 @@ def prepare(tree: Tree, typed: list[str]) -> Tree:
     with folders.locked(folders.folder_of(path)) if is_locked else contextlib.nullcontext():
         is_trusted = tree.get("trust") is True
         if whole and how == "resume" and not (common := populations.common_checkpoints(path)):
-            loaded = folders.trusted(populations.beginning(path), is_trusted)
+            loaded = populations.beginning(path)
+            if not is_trusted:
+                trust.check(loaded.config, loaded.path)
         else:
             if whole:
                 path = common[0] if how == "resume" else populations.folder_of(path, 0)

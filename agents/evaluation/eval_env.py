@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import torch
 
-from megastep.agents import console, factory
+from megastep.agents import console
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.shard import Shard
 from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing
+from megastep.agents.factory import make as factory
 from megastep.agents.factory import settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders, restore

@@ -4,11 +4,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from megastep.agents import console, factory
+from megastep.agents import console
 from megastep.agents.distributed import process_group
 from megastep.agents.evaluation import eval_env, playing, ratings, statistics, tables
 from megastep.agents.evaluation.eval_env import EvalEnv, Player
 from megastep.agents.factory import components, env_failures, settings
+from megastep.agents.factory import make as factory
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.types import optional
 

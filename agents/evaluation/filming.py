@@ -7,10 +7,11 @@ from typing import cast
 import torch
 
 from megastep import recording
-from megastep.agents import console, factory
+from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import eval_env, playing
 from megastep.agents.factory import components, env_failures, settings
+from megastep.agents.factory import make as factory
 from megastep.agents.runs import folders, restore
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.types import PolicyLike, optional

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from megastep import global_generators
-from megastep.agents import factory
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.evaluation import playing
 from megastep.agents.evaluation.eval_env import EvalEnv
+from megastep.agents.factory import make as factory
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
 from megastep.agents.training.budget import reaches

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, cast
 
 import torch
 
-from megastep.agents import console, factory, package
+from megastep.agents import console, package
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import eval_env, tables
 from megastep.agents.factory import check, components, settings
+from megastep.agents.factory import make as factory
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import (
     agent_file,

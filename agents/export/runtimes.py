@@ -21,9 +21,10 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents import factory, package
+from megastep.agents import package
 from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.factory import components
+from megastep.agents.factory import make as factory
 from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.heads import FORBIDDEN
 from megastep.agents.runs import folders, restore

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import cast
 
-from megastep.agents import factory
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import eval_env
 from megastep.agents.export.launches import add_policy
+from megastep.agents.factory import make as factory
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import folders, restore

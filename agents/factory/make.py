@@ -205,11 +205,9 @@ def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
 
 def make_opponents(
     cfg: Train, env: types.Env, sample: types.Env, policy: Policy, seed: int = 1
-) -> Opponents | None:
-    """Returns the environment with opponents in it, None if none. A `sample` tries the bot."""
+) -> Opponents:
+    """Returns the environment with opponents in it. A `sample` tries the bot."""
     chosen, bot = cfg.opponents, None
-    if not (chosen.past or chosen.bot or chosen.league):
-        return None
     if chosen.bot:
         bot = in_env(make_bot(chosen.bot_class, cfg.env, sample), cfg.env, env)
     with errors():

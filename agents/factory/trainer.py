@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from megastep.agents import console, factory
+from megastep.agents import console
 from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.factory import check, conflicts, settings
+from megastep.agents.factory import make as factory
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.runs import (
     agent_file,
@@ -80,13 +81,15 @@ def make_trainer(
         )
     factory.check_memory(cfg.env, sample, learner, n_members=n_members, **where)
     env = factory.construct(cfg.env, **where)
-    loaded = load(cfg, policy, env, learner, device, number)
+    loaded = load(cfg, policy, env, learner, device, number) if cfg.resume or cfg.init else None
     resumed = loaded if cfg.resume else None
     had: dict = (resumed and resumed.state) or Counter()
     observers = []
     if cfg.evaluation.every is not None and make_evaluations is not None:
         observers.append(make_evaluations(cfg, env, device, ranks))
-    opponents = factory.make_opponents(cfg, env, sample, policy, seed)
+    chosen, opponents = cfg.opponents, None
+    if chosen.past or chosen.bot or chosen.league:
+        opponents = factory.make_opponents(cfg, env, sample, policy, seed)
     if resumed and number == 0:
         for name in "checkpoints", "snapshots":
             checkpoint.set_aside_after(folder / name, resumed.step)
@@ -131,11 +134,9 @@ def make_trainer(
     return trainer
 
 
-def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint | None:
-    """Gives the policy the weights of the checkpoint that `cfg` names, if any. Returns it."""
-    if not (start := cfg.resume or cfg.init):
-        return None
-    path = folders.find(start)
+def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint:
+    """Gives the policy the weights of the checkpoint that `cfg` names. Returns it."""
+    path = folders.find(cfg.resume or cfg.init)
     loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, rank)
     restore.load_weights(policy, loaded, env)
     if cfg.init:

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from megastep import engine
-from megastep.agents import console, factory
+from megastep.agents import console
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.pooling import alone
 from megastep.agents.distributed.process_group import from_rank_0
 from megastep.agents.distributed.ranks import ONE
 from megastep.agents.errors import ConfigErrors
+from megastep.agents.factory import make as factory
 from megastep.agents.factory import settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, finishing

@@ -8,18 +8,19 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from megastep import engine
-from megastep.agents import console, factory
+from megastep.agents import console
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.process_group import from_rank_0, together
 from megastep.agents.distributed.ranks import DriftError
 from megastep.agents.errors import EnvFailed, UserError, memory_problem, user_errors
 from megastep.agents.factory import env_failures, settings
+from megastep.agents.factory import make as factory
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, signals
 from megastep.agents.runs import folders, provenance
@@ -46,6 +47,7 @@ class Run:
     """
 
     title, of_each = "Training", ""  # of messages
+    around: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
     folder: Path
     training: Any
     trainers: Sequence[Trainer]
@@ -90,7 +92,7 @@ class Run:
                 self.folder, source = from_rank_0(lambda: self.open(locks))
                 if self.is_first and is_new:
                     undo.callback(shutil.rmtree, self.folder, ignore_errors=True)
-            token = check_shared(self.folder)
+            token = check_shared(self.folder) if self.n_ranks > 1 else ""
             if self.team:
                 self.team.set_folder(self.folder)
             caught = env_failures.caught(self.cfg.env, self.folder, rank=process_group.rank())
@@ -171,9 +173,6 @@ class Run:
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
 
-    def around(self) -> contextlib.AbstractContextManager:
-        return contextlib.nullcontext()
-
     def saved(self) -> str:
         """Returns how much of a run that ended with an error is saved, and how to resume it."""
         trainer = self.training
@@ -250,8 +249,6 @@ def check_shared(folder: Path) -> str:
         UserError: on all ranks, if one of them does not see the folder.
     """
     name = from_rank_0(secrets.token_hex)
-    if process_group.n_ranks() == 1:
-        return name
     path = folder / f".ranks-{name}"
 
     def wait_for_file() -> None:

@@ -7,9 +7,10 @@ import warnings
 from pathlib import Path
 
 from megastep import workers
-from megastep.agents import console, factory
+from megastep.agents import console
 from megastep.agents.errors import shortened
 from megastep.agents.factory import check, settings
+from megastep.agents.factory import make as factory
 from megastep.agents.launch import endings, gpu, launcher, rank
 from megastep.agents.launch.run import Run
 from megastep.agents.runs import typed_json

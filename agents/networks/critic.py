@@ -212,7 +212,7 @@ class Critic(nn.Module):
         if not self.is_asymmetric:
             return self.output(features)
         assert encoded is not None
-        return self._value((features, self.intake.projected(encoded)))
+        return self._value((features, linear(encoded, self.intake.project, self.intake.activation)))
 
     @fused(_value_on_gpu, _fits_value)
     def _value(self, joined) -> torch.Tensor:
@@ -294,7 +294,7 @@ class _JointHeads(torch.autograd.Function):
 def _terms_on_gpu(output, critic, prediction, features, encoded, actions, mask=None) -> Terms:
     n_agents, n_choices = output.shape
     sizes = _Sizes(len(prediction.weight), n_agents, n_choices, features.shape[-1])
-    inputs = features, critic.intake.projected(encoded)
+    inputs = features, linear(encoded, critic.intake.project, critic.intake.activation)
     layers = prediction, output.linear, critic.hidden, critic.output.linear
     parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
     value = _value_parameters(critic.output)

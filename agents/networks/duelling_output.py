@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep import spaces
 from megastep.agents.networks.fused import LIBRARY, aligned, fused
-from megastep.agents.networks.heads import FORBIDDEN, Output, gather
+from megastep.agents.networks.heads import FORBIDDEN, Output
 from megastep.agents.networks.linear import (
     cast,
     compute_dtype,
@@ -188,4 +188,4 @@ class DuellingOutput(Output):
 
     def action_value(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Returns the value (...,) of actions."""
-        return gather(logits, actions)
+        return logits.gather(-1, actions.long()[..., None]).squeeze(-1).sum(-1)

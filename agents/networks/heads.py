@@ -220,16 +220,11 @@ class MultiDiscreteOutput(Output):
 
     def logprob(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Returns the log-probability (...,) of actions."""
-        return gather(logits, actions)
+        return logits.gather(-1, actions.long()[..., None]).squeeze(-1).sum(-1)
 
     def entropy(self, logits: torch.Tensor) -> torch.Tensor:
         """Returns the entropy (...,) in nats."""
         return -(logits.exp() * logits).sum((-1, -2))
-
-
-def gather(values: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-    """Returns the entries (..., A, n) of the actions (..., A), summed over agents."""
-    return values.gather(-1, actions.long()[..., None]).squeeze(-1).sum(-1)
 
 
 # ---- Dicts of actions ----

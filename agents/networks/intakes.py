@@ -251,11 +251,7 @@ class ConcatIntake(nn.Module):
         """Returns the projected features (..., width) of leaves (..., *shape), or of some `lanes`,
         (M,) int64, of leaves (T, B, ...).
         """
-        return self.projected(self.encode(obs, lanes))
-
-    def projected(self, encoded: torch.Tensor) -> torch.Tensor:
-        """Returns the features (..., width) of what `encode` returned."""
-        return linear(encoded, self.project, self.activation)
+        return linear(self.encode(obs, lanes), self.project, self.activation)
 
     @fused(_encode_on_gpu, _fits)
     def encode(self, obs: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:

@@ -6,7 +6,7 @@ T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, 
 
 import copy
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import torch
@@ -301,7 +301,8 @@ class Policy(nn.Module):
         """
         from megastep.agents.distributed.pooling import pool_moments  # who acts has no ranks
 
-        self.add_moments(pool_moments(*self.moments(obs, privileged, is_counted)))
+        moments = pool_moments(*self.moments(obs, privileged, is_counted))
+        running_norm.add_moments(self.norms, moments)
 
     def moments(
         self, obs: Tree, privileged: Tree | None = None, is_counted: torch.Tensor | bool = True
@@ -311,12 +312,6 @@ class Policy(nn.Module):
         if self.privileged_space:
             observations += self.critic.intake.normalised_leaves(privileged)
         return running_norm.moments_of(self.norms, observations, is_counted)
-
-    def add_moments(
-        self, moments: "Sequence[Moments]", is_counted: torch.Tensor | None = None
-    ) -> None:
-        """Adds pooled `moments` to the statistics, unless `is_counted`, () bool, is false."""
-        running_norm.add_moments(self.norms, moments, is_counted)
 
     def clear_stats(self) -> None:
         """Makes observations and values 0 until there are statistics of them, so that learning does

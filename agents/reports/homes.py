@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from megastep.agents import factory
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.evaluation.statistics import SCORES
 from megastep.agents.factory import check, components
+from megastep.agents.factory import make as factory
 from megastep.agents.reports import runs
 from megastep.agents.runs import folders, trust
 
@@ -64,7 +64,7 @@ def plans_of(run: runs.Run, table: Mapping) -> list:
     trained = factory.config_of(loaded)
     chosen, geometry = table["evaluation"], trained.geometry
     if typed := chosen.get("geometry"):
-        trust.check({"train": {"geometry": typed}}, "An evaluation")
+        trust.check({"train": {"geometry": typed}}, "An evaluation", "")
         geometry = check.check(components.kind_of("geometry", str(typed["name"])), typed)
     return factory.homes(trained.env, geometry, str(chosen["split"]))
 

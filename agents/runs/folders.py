@@ -154,22 +154,22 @@ def find(name: str, member: int | str | None = "best") -> Path:
         member: of a population, if the path is a population's: a number, or `best`; None: the
             population's own folder.
     """
-    path, folders, agents = Path(name), known(), pretrained()
-    if name == "latest" and folders:
+    path = Path(name)
+    if name == "latest" and (folders := known()):
         path = folders[-1]
     if populations.is_root(path):
         return path if member is None else populations.member(path, member)
     is_run = any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints"))
     if is_run or (agent_file.is_agent_file(path) and os.path.isfile(path)):
         return path
-    problem = "is neither a run folder nor a pretrained agent"
+    problem, agents = "is neither a run folder nor a pretrained agent", pretrained()
     if os.path.exists(path):
         problem = "is not a run: it has no folder checkpoints"
         if name in agents:
             raise UserError(f"{name} {problem}; rename it to use the pretrained agent {name}")
     elif name in agents:
         return agents[name]
-    near = difflib.get_close_matches(name, map(str, folders), n=1, cutoff=0.4)
+    near = difflib.get_close_matches(name, map(str, known()), n=1, cutoff=0.4)
     near += difflib.get_close_matches(name, agents, n=1, cutoff=0.6)
     cure = f"train.py makes runs, and pretrained agents are {', '.join(agents)}"
     cure = f"did you mean {' or '.join(near)}?" if near else cure
@@ -200,14 +200,8 @@ def load_checkpoint(
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
     with user_errors(f"The configuration in {loaded.path} is not a run's: "):
         typed_json.check(typed_json.Config, loaded.config)
-    return trusted(loaded, is_trusted)
-
-
-def trusted(loaded: checkpoint.Checkpoint, is_trusted: bool) -> checkpoint.Checkpoint:
-    """Returns a checkpoint whose import paths may be imported. Raises UserError for others."""
     if not is_trusted:
-        cure = "; if you trust it, train, evaluate and record take trust=true"
-        trust.check(loaded.config, loaded.path, cure)
+        trust.check(loaded.config, loaded.path)
     return loaded
 
 

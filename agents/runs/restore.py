@@ -38,7 +38,13 @@ def policy_of(
     settings = loaded.config["train"]["agent"]
     kinds = (ValueError, TypeError, KeyError, RuntimeError)
     with user_errors(f"{loaded.path} cannot be used: ", kinds):
-        tree = _nested(loaded.config["spaces"])
+        tree: dict = {}
+        for name, text in loaded.config["spaces"].items():
+            *keys, last = name.split(".")
+            branch = tree
+            for key in keys:
+                branch = branch.setdefault(key, {})
+            branch[last] = spaces.from_text(text)
         if device.type == "cpu":
             share_threads(settings["width"])
         seen = tree["obs"], tree["actions"], optional(env, "privileged_space") if env else None
@@ -88,15 +94,3 @@ def spaces_of(env: Env | Policy) -> dict[str, str]:
     """Returns the spaces of an environment or policy: {'obs.rgb': 'MultiImage(...)', ...}."""
     tree = {"obs": env.obs_space, "actions": env.action_space}
     return {name: repr(space) for name, space in spaces.leaves(tree).items()}
-
-
-def _nested(texts) -> dict:
-    """Returns the tree of spaces that `spaces_of` wrote."""
-    tree = {}
-    for name, text in texts.items():
-        *keys, last = name.split(".")
-        branch = tree
-        for key in keys:
-            branch = branch.setdefault(key, {})
-        branch[last] = spaces.from_text(text)
-    return tree

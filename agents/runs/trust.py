@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 #: Settings groups that may contain import paths.
 GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum", "logger", "callbacks")
+CURE = "; if you trust it, train, evaluate and record take trust=true"
 #: Import paths of megastep's own components.
 OWN = re.compile(
     r"megastep\.(envs|geometries|agents\.(algorithms|networks|selfplay|training))(\.\w+)*:\w+"
@@ -59,13 +60,12 @@ def untrusted(names: Iterable[str]) -> list[str]:
     return [name for name in names if name not in known]
 
 
-def check(config: "Config", source: object, cure: str = "") -> None:
+def check(config: "Config", source: object, cure: str = CURE) -> None:
     """Raises UserError if a configuration, which `source` holds, names what may not be imported.
-
-    Args:
-        cure: the end of the sentence.
+    `cure` is the end of the sentence.
     """
-    if names := untrusted(foreign_names(config)):
+    names = foreign_names(config)
+    if names and (names := untrusted(names)):
         raise UserError(
             f"{source} would import {shortened(', '.join(names))}, which runs code outside "
             f"megastep that you have not trained with here{cure}"

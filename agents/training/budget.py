@@ -130,7 +130,8 @@ class AnnealingRecord:
     """
 
     def __init__(self, folder: Path | str, n_updates: int = 0):
-        n_bytes = min(n_updates, len(read_record(folder))) * array("d").itemsize
+        n_updates = min(n_updates, len(read_record(folder))) if n_updates else 0
+        n_bytes = n_updates * array("d").itemsize
         self.file = AppendedFile(Path(folder) / RECORD, n_bytes)
 
     def on_rollout(self, trainer: Any, rollout: object) -> None:

@@ -130,5 +130,5 @@ def check_flag(error_flag: torch.Tensor, objects: Objects | None = None) -> None
 
 def check_on_cpu(agents: Agents) -> None:
     """Does what :func:`check` does if the agents are on the CPU, where nothing synchronises."""
-    if agents.error_flag.is_cpu:
+    if agents.error_flag.is_cpu and agents.error_flag.item():
         check(agents)

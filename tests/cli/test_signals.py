@@ -11,9 +11,9 @@ import time
 import pytest
 
 from megastep import recording
-from megastep.agents import factory
 from megastep.agents.cli import train
 from megastep.agents.evaluation import playing
+from megastep.agents.factory import make as factory
 from megastep.agents.launch import signals
 from megastep.agents.runs import checkpoint, folders, provenance
 from megastep.agents.storage.collector import Collector

@@ -14,11 +14,11 @@ import torch
 import yaml
 
 from megastep import engine, envs
-from megastep.agents import factory
 from megastep.agents.algorithms import ppo
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.cli import evaluate, train
 from megastep.agents.errors import ConfigErrors, UserError, shortened
+from megastep.agents.factory import make as factory
 from megastep.agents.factory.check import check
 from megastep.agents.factory.settings import Train
 from megastep.agents.factory.trainer import annealed

@@ -12,7 +12,8 @@ NOTEBOOK = """
 import sys
 from pathlib import Path
 from megastep import envs, geometries, recording
-from megastep.agents import factory, pretrained
+from megastep.agents import pretrained
+from megastep.agents.factory import make as factory
 from megastep.agents.evaluation import playing, statistics
 from megastep.agents.factory import components
 from megastep.agents.runs.saver import Saver

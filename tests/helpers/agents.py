@@ -1,6 +1,6 @@
 """The environments of agents, with floor plans of a test's own."""
 
-from megastep.agents import factory
+from megastep.agents.factory import make as factory
 from megastep.agents.factory import settings
 from megastep.agents.runs import folders, restore
 

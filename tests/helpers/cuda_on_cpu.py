@@ -106,7 +106,7 @@ class CudaOnCpu:
         blocks = shape if isinstance(shape, Blocks) else Blocks(-(-shape // BLOCK))
         if not all(blocks[:3]):
             return
-        packed = library.packers[library.cuda_operations[operation]](fields)
+        packed = vars(library.params)[library.cuda_operations[operation]](**fields)
         if library not in self._libraries:
             self._libraries[library] = self._build(library)
         function = getattr(self._libraries[library], f"run_{operation}")

@@ -88,13 +88,13 @@ def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
     pack = {name: kernel_library.packer(layout) for name, layout in structs.items()}
     numbers = [dict(count=i, size=i + 0.5, mask=2**31 + i) for i in range(2)]
     pointers = [dict(count=5 + i, values=2**40 + i, size=-i) for i in range(2)]
-    numbers = [pack["NumbersParams"](fields) for fields in numbers]
-    pointers = [pack["PointerParams"](fields) for fields in pointers]
+    numbers = [pack["NumbersParams"](**fields) for fields in numbers]
+    pointers = [pack["PointerParams"](**fields) for fields in pointers]
     arrays = dict(numbers=b"".join(numbers), pointers=b"".join(pointers))
     packed = dict(
-        ArraysParams=pack["ArraysParams"](dict(first=-1, second=-2, third=-3, **arrays)),
-        OneParams=pack["OneParams"](dict(first=-1, one=numbers[1])),
-        MoreParams=pack["MoreParams"](dict(more=7, others=8, count=9, values=10, size=0.5)),
+        ArraysParams=pack["ArraysParams"](first=-1, second=-2, third=-3, **arrays),
+        OneParams=pack["OneParams"](first=-1, one=numbers[1]),
+        MoreParams=pack["MoreParams"](more=7, others=8, count=9, values=10, size=0.5),
     )
     code = (
         NESTED

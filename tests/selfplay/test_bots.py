@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from megastep import envs, toys
-from megastep.agents import factory
 from megastep.agents.cli import evaluate, train
 from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing, statistics
 from megastep.agents.evaluation.playing import first_episodes
+from megastep.agents.factory import make as factory
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.bots.plans import Plans
 from megastep.agents.selfplay.bots.random import RandomActions

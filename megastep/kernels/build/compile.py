@@ -45,7 +45,11 @@ def cpu(library: KernelLibrary) -> dict[str, Callable[[bytes], None]]:
         return {}
     command, version = compiler()
     files = library.sources(".h", ".cpp")
-    key = _key(*files, *files.values(), *library.cpu_flags, command, version, _processor())
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    features = (line for line in lines if line.startswith(("flags", "Features")))
+    processor = next(features, platform.machine() + platform.processor())  # for -march=native
+    key = _key(*files, *files.values(), *library.cpu_flags, command, version, processor)
     name = f"cpu-{key}.so"
     binary = _load(name, *cache.fetch(name, lambda: _build_cpu(library, command)))
     end_threads_at_forks(binary)
@@ -92,14 +96,6 @@ def _run(command, needs="", **env) -> str:
         output = " ".join(process.stderr.split())[:500]
         raise EngineError(f"{command[0]} could not build {needs}. Its output: {output}")
     return process.stdout
-
-
-def _processor() -> str:
-    """Returns the CPU's features, which -march=native depends on."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    features = (line for line in lines if line.startswith(("flags", "Features")))
-    return next(features, platform.machine() + platform.processor())
 
 
 def _build_cpu(library, command) -> bytes:

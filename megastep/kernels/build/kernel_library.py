@@ -52,9 +52,9 @@ OPERATION = re.compile(
 COMMENT = re.compile(r"//.*|/\*[\s\S]*?\*/")
 TYPES: dict[str, Any] = {"int": ctypes.c_int, "float": ctypes.c_float}
 TYPES["unsigned int"] = ctypes.c_uint
-#: The source of a function of {field: value} that packs a struct.
+#: The source of a function that packs a struct.
 PACKED = """
-def packed(values):
+def packed(**values):
     if len(values) == len(names):
         try:
             return pack({})
@@ -92,9 +92,7 @@ class KernelLibrary:
         structs: {struct: its layout in memory}.
         words: {struct: all its pointers and numbers}, those of structs that are fields too. Where
             pointers take 4 bytes, as in WebAssembly, a struct is an array of them, 4 bytes each.
-        packers: {struct: function of {field: value} that packs one}.
-        params: the same by keywords; ``params.RowParams(n=64, ...)`` packs one that is a field of
-            another.
+        params: functions that pack a struct: ``params.RowParams(n=64, ...)``.
         cpu_operations, cuda_operations: {operation: struct} for the CPU and the GPU.
         early_operations: those that a GPU may start before the previous kernel has ended: their
             first statement, in each definition behind ``#if``, is ``wait_for_previous();``.
@@ -127,14 +125,9 @@ class KernelLibrary:
         return {name: [*_words(layout)] for name, layout in self.structs.items()}
 
     @cached_property
-    def packers(self) -> dict[str, Callable[[Mapping[str, object]], bytes]]:
-        return {name: packer(layout) for name, layout in self.structs.items()}
-
-    @cached_property
     def params(self) -> SimpleNamespace:
-        packers = self.packers.items()
-        keywords = {name: lambda pack=pack, /, **fields: pack(fields) for name, pack in packers}
-        return SimpleNamespace(**keywords)
+        packers = {name: packer(layout) for name, layout in self.structs.items()}
+        return SimpleNamespace(**packers)
 
     @cached_property
     def cpu_operations(self) -> dict[str, str]:
@@ -203,9 +196,9 @@ def _words(layout, title="", start=0) -> Iterator[Word]:
             yield Word(title + name, kind._type_, at)
 
 
-def packer(layout: Any) -> Callable[[Mapping[str, object]], bytes]:
-    """Returns a function of {field: value} that packs a struct, or raises a TypeError unless it
-    gets each field, and no other. A pointer is a tensor, an address, or None for null. An array is
+def packer(layout: Any) -> Callable[..., bytes]:
+    """Returns a function of a struct's fields that packs one, or raises a TypeError unless it gets
+    each field, and no other. A pointer is a tensor, an address, or None for null. An array is
     the joined bytes of its structs; those that are missing at its end are zeros.
     """
     address = "x if (x := values[{!r}]).__class__ is int else 0 if x is None else x.data_ptr()"

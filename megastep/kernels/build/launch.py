@@ -65,7 +65,7 @@ def launch(
             f"No {suffix} file in {library.folder} defines the operation {operation}: add one, or "
             f"use device={other}."
         )
-    packed = library.packers[struct](fields)
+    packed = vars(library.params)[struct](**fields)
     if is_cpu:
         for observer in _OBSERVERS:
             observer(library, operation, packed)
