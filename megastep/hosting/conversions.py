@@ -116,8 +116,11 @@ def _image(space) -> Conversion | None:
     """Returns the conversion of a Box that is an image or a stack of images, None if it is not.
 
     What has other axes than rows, columns and a few channels must be uint8 or have the same bounds
-    everywhere, unlike a stack of vectors.
+    everywhere, unlike a stack of vectors. A wrapper marks a smaller one, (C, H, W) uint8, by an
+    attribute ``is_image``.
     """
+    if getattr(space, "is_image", False):
+        return spaces.MultiImage(1, *space.shape, dtype=torch.uint8), lambda x: x[:, None]
     if type(space).__name__ != "Box" or len(space.shape) not in (2, 3, 4):
         return None
     is_uint8, shape = space.dtype == np.uint8, space.shape

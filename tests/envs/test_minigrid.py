@@ -2,6 +2,7 @@
 end.
 """
 
+import json
 import re
 
 import numpy as np
@@ -10,10 +11,11 @@ import torch
 from torch.utils._pytree import tree_leaves as leaves
 
 from megastep import envs
-from megastep.agents.cli import train
+from megastep.agents.cli import evaluate, train
 from megastep.arrdict import arrdict
+from megastep.envs.minigrid.original import as_here
 from megastep.envs.minigrid.tasks import TASKS
-from tests.helpers.minigrids import mission_of, original
+from tests.helpers.minigrids import original
 from tests.helpers.pages import ROOT
 from tests.helpers.pong_twins import philox
 
@@ -39,11 +41,9 @@ class OurDraws:
 
 
 def assert_equal(world, e, obs, reward, terminated, truncated):
-    ours = world.obs.image[e, 0].permute(2, 1, 0).numpy()  # x, y, channel
-    assert np.array_equal(ours, obs["image"])
-    assert int(world.obs.direction[e]) == obs["direction"]
-    if "mission" in world.obs:
-        assert np.array_equal(world.obs.mission[e, 0].numpy(), mission_of(obs["mission"]))
+    theirs = as_here(obs, "mission" in world.obs)
+    assert theirs.keys() == world.obs.keys()
+    assert all(np.array_equal(world.obs[key][e, 0], value) for key, value in theirs.items())
     assert float(world.reward[e]) == np.float32(reward)
     assert (bool(world.terminal[e]), bool(world.truncated[e])) == (
         terminated,
@@ -110,6 +110,32 @@ def test_gpu_has_the_bits_of_the_cpu(id):
         worlds[-1].append(arrdict(cells=env.cells, games=env.games))
     for ours, theirs in zip(*worlds, strict=True):
         assert all((a == b.cpu()).all() for a, b in zip(leaves(ours), leaves(theirs), strict=True))
+
+
+@pytest.mark.slow
+def test_agents_play_here_as_in_the_original(tmp_path, monkeypatch):
+    pytest.importorskip("minigrid", minversion="3.2", reason="needs minigrid of Python 3.11")
+    monkeypatch.chdir(tmp_path)
+    id, wrapper = "MiniGrid-Empty-Random-5x5-v0", "megastep.envs.minigrid.original:AsHere"
+    here, there = (
+        ["env=minigrid", f"env.id={id}"],
+        ["env=gymnasium", f"env.id=minigrid:{id}", f"env.wrappers=[{wrapper}]"],
+    )
+    small = "agent.encoder=categories agent.core=none agent.width=32 device=cpu".split()
+    for name, trained_in, samples in ("here", here, 40000), ("there", there, 4000):
+        words = [*small, "env.n_envs=32", f"samples={samples}", f"folder={name}"]
+        assert train.main([*trained_in, *words]) == 0
+        rows = []
+        for played_in in here, there:
+            words = [f"run={name}", "episodes=128", "device=cpu", "baseline=none"]
+            assert evaluate.main([*played_in, *words]) == 0
+            tables = (tmp_path / name / "evaluations").glob("*.json")
+            newest = max(tables, key=lambda path: path.stat().st_mtime_ns)
+            rows.append(json.loads(newest.read_text())["rows"][0])
+        (a, b) = rows
+        assert a["lower"] < b["upper"] and b["lower"] < a["upper"]
+        if name == "here":
+            assert min(row["metrics"]["success"]["mean"] for row in rows) > 0.9
 
 
 def empty_rooms(seed):

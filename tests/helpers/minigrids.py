@@ -11,11 +11,10 @@ import torch
 from scipy.stats import chi2_contingency
 
 from megastep import envs
+from megastep.envs.minigrid.original import mission_of
 from megastep.envs.minigrid.tasks import LIBRARY, TASKS
 
 CONSTANTS = LIBRARY.constants
-KINDS = "key", "ball", "box"
-COLOURS = "red", "green", "blue", "purple", "yellow", "grey"
 DOORS = "OPEN_DOOR", "CLOSED_DOOR", "LOCKED_DOOR"  # by the original's states
 N_BUCKETS = 32
 
@@ -27,17 +26,6 @@ def original(id, rooms=None):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a newer version of a task is there
         return gymnasium.make(id, disable_env_checker=True, **kwargs).unwrapped
-
-
-def mission_of(text):
-    """Returns the one-hot mission (18,) of a text."""
-    words, row = text.split(), np.zeros(18)
-    places = [i for i, word in enumerate(words) if word in COLOURS]
-    for part, place in enumerate(places):
-        row[9 * part + COLOURS.index(words[place])] = 1
-        if words[place + 1] in KINDS:
-            row[9 * part + 6 + KINDS.index(words[place + 1])] = 1
-    return row
 
 
 # ---- Layouts: a row each of the cells, the agent's place and direction, and the mission ----

@@ -38,7 +38,7 @@ class MiniGrid(DisplayedEnv):
     Observation:
         ``image`` (N, 1, 3, 7, 7) uint8: kind, colour and state of each cell that the agent sees, as
         the original's ``image`` with the channel first and rows before columns. ``direction``
-        (N, 1) integers: 0 right, 1 down, 2 left, 3 up. ``mission`` (N, 1, 18) float16, in tasks
+        (N, 1) integers: 0 right, 1 down, 2 left, 3 up. ``mission`` (N, 1, 18) float32, in tasks
         whose mission differs between episodes: one-hot colour and kind (key, ball, box) of what the
         mission names, and of its second object.
 
@@ -98,7 +98,9 @@ class MiniGrid(DisplayedEnv):
             "direction": spaces.MultiDiscrete(1, 4),
         }
         if self.task.has_mission:
-            self.obs_space["mission"] = spaces.MultiVector(1, N_MISSION, low=0.0, high=1.0)
+            self.obs_space["mission"] = spaces.MultiVector(
+                1, N_MISSION, dtype=torch.float32, low=0.0, high=1.0
+            )
         shape = n_envs, self.task.height, self.task.width
         engine.fit(n_envs, 512 + shape[1] * shape[2], self.device)
         on: dict = dict(device=self.device)
@@ -119,7 +121,7 @@ class MiniGrid(DisplayedEnv):
 
     def _world(self, actions) -> arrdict:
         n, task = self.n_envs, self.task
-        outputs = step_outputs(self, 1, dict(mission=N_MISSION * task.has_mission), {})
+        outputs = step_outputs(self, 1, {}, dict(mission=N_MISSION * task.has_mission))
         image = torch.empty((n, 1, 3, VIEW, VIEW), dtype=torch.uint8, device=self.device)
         obs = arrdict(image=image, direction=torch.empty_like(actions))
         if task.has_mission:

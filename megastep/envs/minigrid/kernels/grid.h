@@ -12,7 +12,7 @@ struct MiniGridStepParams : OutcomeParams {
     const long long* actions;      // (N)
     unsigned char* image;          // (N, 3, VIEW, VIEW) out, as the next two
     long long* direction;          // (N) 0 right, 1 down, 2 left, 3 up
-    unsigned short* mission;       // (N, N_MISSION) fp16, or null
+    float* mission;                // (N, N_MISSION), or null
     const unsigned char* layouts;  // (D, H, W) for CUSTOM, or null
     const int* starts;             // (D, 3): x, y and direction of the agent
     int* error_flag;               // (1) out: see common/errors.h

@@ -189,11 +189,11 @@ HD void write_view(const Game& g, const Grid& grid, unsigned char* image) {
 }
 
 // One-hot: a colour and a kind (key, ball, box), of what to move and of where to.
-HD void write_mission(const Game& g, unsigned short* mission) {
+HD void write_mission(const Game& g, float* mission) {
     for (int i = 0; i < N_MISSION; i++) {
         int cell = g.mission[i / 9], k = i % 9;
         int is_set = cell && (k < 6 ? colour_of(cell) == k : kind_of(cell) - KEY == k - 6);
-        mission[i] = HALF_BITS((float)is_set);
+        mission[i] = (float)is_set;
     }
 }
 
