@@ -149,6 +149,7 @@ OUTSIDE_USERS = {
         "megastep/adapters/*.py",
         "megastep/data/formats.py",
         "megastep/envs/gymnasium.py",
+        "megastep/envs/minigrid/original.py",
         "megastep/envs/pettingzoo.py",
         "megastep/hosting/*.py",
     ),
