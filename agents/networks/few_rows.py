@@ -1,25 +1,22 @@
-"""Matrix products of few rows on a GPU, and a step of the LSTM, in blocks that leave a
-multiprocessor to several others. The libraries' products of a few hundred rows take most of the GPU
-for themselves, and those of many streams wait for each other.
+"""Matrix products of few rows on a GPU, in blocks that leave a multiprocessor to several others.
+The libraries' products of a few hundred rows take most of the GPU for themselves, and those of many
+streams wait for each other.
 
-N rows, K inputs, M outputs; B lanes, W units. Matrices are bfloat16 and on one GPU. Their rows are
-contiguous and start at multiples of 16 bytes, which K and M fill.
+N rows, K inputs, M outputs. Matrices are bfloat16 and on one GPU. Their rows are contiguous and
+start at multiples of 16 bytes, which K and M fill.
 """
 
 from pathlib import Path
 
 import torch
 
-from megastep.agents.networks.fused import aligned, fused
-from megastep.arrdict import arrdict
+from megastep.agents.networks.fused import fused
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels" / "few_rows", FAST_CUDA_FLAGS)
-WIDTHS = 128, 256  # of a step
-MAX_ROWS, _TILE, _TILE_THREADS, _TILE_BYTES, _LANES, _UNITS, _THREADS = (
-    LIBRARY.constants[name]
-    for name in "MAX_ROWS TILE TILE_THREADS TILE_BYTES STEP_LANES STEP_UNITS STEP_THREADS".split()
+MAX_ROWS, _TILE, _TILE_THREADS, _TILE_BYTES = (
+    LIBRARY.constants[name] for name in ("MAX_ROWS", "TILE", "TILE_THREADS", "TILE_BYTES")
 )
 
 
@@ -65,34 +62,3 @@ def multiply(
         **dict(left_stride=x.stride(0), right_stride=weight.stride(0), result_stride=out.stride(0)),
     )
     return out
-
-
-def lstm_step(
-    x: torch.Tensor,
-    weight: torch.Tensor,
-    bias: torch.Tensor,
-    reset: torch.Tensor,
-    state: arrdict,
-    is_residual: bool,
-) -> tuple[torch.Tensor, arrdict]:
-    """Returns output (B, W) and state after a step, without what its gradient needs. Gates are
-    float32.
-
-    Args:
-        x: (B, W), W in `WIDTHS`; added to the output if `is_residual`.
-        weight: (4 W, 2 W): of x, then of the last output.
-        bias: (4 W,).
-        reset: (B,) bool; clears a lane's state before the step.
-        state: arrdict(output, cell), (B, W) float32 each, before the step.
-    """
-    x, output, width = aligned(x), torch.empty_like(x), x.shape[1]
-    after = state.map(torch.empty_like)
-    n_blocks = -(-len(x) // _LANES) * width // _UNITS
-    launch(
-        *(LIBRARY, f"lstm_step_{width}", x.device, Blocks(n_blocks, threads=_THREADS)),
-        **dict(x=x, weight=weight, bias=bias, reset=reset, output=output),
-        **dict(last_output=state["output"], last_cell=state["cell"]),
-        **dict(next_output=after["output"], next_cell=after["cell"]),
-        **dict(n_lanes=len(x), is_residual=int(is_residual)),
-    )
-    return output, after

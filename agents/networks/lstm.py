@@ -7,8 +7,7 @@ cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell w
 additions away.
 
 `lstm_sequence` is the recurrence in PyTorch. A CPU runs a whole sequence in one kernel, and so does
-a GPU with clusters of blocks (Hopper and later). When acting, a GPU has one product of inputs and
-last outputs, or with few lanes one kernel for all.
+a GPU with clusters of blocks (Hopper and later). When acting, one kernel does a step (`step.py`).
 """
 
 from collections.abc import Callable
@@ -20,16 +19,14 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from megastep.agents.networks import few_rows
+from megastep.agents.networks import step
 from megastep.agents.networks.fused import (
-    DTYPES,
     LIBRARY,
     aligned,
     check_shapes,
     fused,
     has_hopper,
     is_built_for_cpu,
-    launch_units,
 )
 from megastep.agents.networks.linear import (
     cast,
@@ -263,39 +260,26 @@ def lstm_sequence(
 
 
 def _act_on_gpu(core, x, reset, state, is_residual=False) -> tuple[torch.Tensor, arrdict]:
-    """Computes one step with one product of inputs and last outputs."""
+    """Computes one step in one kernel. The next state's output is bfloat16, which loses nothing."""
     check_shapes(x, reset, state)
-    dtype = compute_dtype(core.recurrent.weight)
-    weight = cast_joined((core.input.weight, core.recurrent.weight), dtype)
-    bias = cast(core.input.bias, dtype)
-    x, reset = aligned(x[0].to(dtype)), reset[0].contiguous().bool()
-    last = arrdict({key: aligned(state[key].float()) for key in ("output", "cell")})
-    if core.width in few_rows.WIDTHS and few_rows.fits(x, weight):
-        output, after = few_rows.lstm_step(x, weight, bias, reset, last, is_residual)
-        return output[None], after
-    output, joined = torch.empty_like(x), x.new_empty(len(x), 2 * core.width)
-    after = last.map(torch.empty_like)
-    launch_units(
-        *("lstm_join", dtype, last.output),
-        **dict(reset=reset, x=x, last_output=last.output, joined=joined),
+    x, reset = x.to(torch.bfloat16), reset.bool()
+    weight = cast_joined((core.input.weight, core.recurrent.weight), x.dtype)
+    bias = cast(core.input.bias, x.dtype)
+    outputs, cell, output = step.step(
+        *(step.LSTM, x, weight, bias, reset, state["cell"].float(), is_residual, state["output"])
     )
-    with torch.autocast(x.device.type, enabled=False):
-        gates = F.linear(joined, weight, bias)
-    launch_units(
-        *("lstm_act", dtype, last.cell),
-        **dict(gates=gates, reset=reset, last_cell=last.cell, residual=x if is_residual else None),
-        **dict(output=output, next_output=after.output, next_cell=after.cell),
-    )
-    return output[None], after
+    return outputs, arrdict(output=output, cell=cell)
 
 
 def _acts_on_gpu(core, x, *_, **__) -> bool:
-    is_step = x.is_cuda and len(x) == 1 and not torch.is_grad_enabled()
-    return is_step and compute_dtype(core.recurrent.weight) in DTYPES
+    dtype = compute_dtype(core.recurrent.weight)
+    return not torch.is_grad_enabled() and step.fits(step.LSTM, x, dtype)
 
 
 class LSTM(nn.Module):
-    """An LSTM of `width` units. Its hidden state is arrdict(output, cell), each (B, W) float32."""
+    """An LSTM of `width` units. Its hidden state is arrdict(output, cell), each (B, W) float32, but
+    the output bfloat16 after a step by a kernel: the same numbers.
+    """
 
     adds_input = True
 

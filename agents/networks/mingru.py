@@ -14,22 +14,20 @@ Matrix products run in the compute dtype (autocast's). The recurrence is float32
 steps a bfloat16 state would round small additions away.
 
 A GPU has a kernel for the recurrence over a sequence, and one for its gradient. When acting, one
-kernel does product and recurrence on a GPU with much shared memory (Hopper and later).
+kernel does product and recurrence (`step.py`).
 """
-
-from pathlib import Path
 
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from megastep.agents.networks import step
 from megastep.agents.networks.fused import (
     DTYPES,
     LIBRARY,
     aligned,
     check_shapes,
     fused,
-    has_hopper,
     launch_units,
 )
 from megastep.agents.networks.linear import (
@@ -41,15 +39,8 @@ from megastep.agents.networks.linear import (
     sum_rows,
 )
 from megastep.arrdict import arrdict
-from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
-ACTING = KernelLibrary(Path(__file__).parent / "kernels" / "acting", FAST_CUDA_FLAGS)
-_LANES, _UNITS, _PARTS, _THREADS = (
-    ACTING.constants[f"STEP_{name}"] for name in "LANES UNITS PARTS THREADS".split()
-)
-#: Widths that one step's kernel has.
-WIDTHS = tuple(range(_UNITS, (_PARTS + 1) * _UNITS, _UNITS))
 _LARGEST_BLOCK = 256  # threads, of the backward kernel
 _MANY_BLOCKS = 128  # about one per multiprocessor
 
@@ -63,7 +54,7 @@ def _forward_on_gpu(gates, reset, start, residual=None, has_states=False) -> tup
     outputs, last = gates.new_empty(*reset.shape, start.shape[1]), torch.empty_like(start)
     states = torch.empty_like(outputs) if has_states else None
     launch_units(
-        *("mingru_step" if len(gates) == 1 else "mingru_forward", gates.dtype, start),
+        *("mingru_forward", gates.dtype, start),
         **dict(gates=gates, reset=reset, start=start, residual=residual),
         **dict(states=states, outputs=outputs, last=last, n_steps=len(gates)),
     )
@@ -140,44 +131,6 @@ def recurrence_backward(
     return d_gates, d_bias, d_start, d_outputs.clone() if has_residual else None
 
 
-# ---- One step in one kernel ----
-
-
-@fused(lambda x: True, lambda x: _fits_step(x))
-def fits_step(x: torch.Tensor) -> bool:
-    """Returns whether `step` takes inputs x (T, B, W) of this dtype on their device."""
-    return False
-
-
-def _fits_step(x) -> bool:
-    width = x.shape[-1]
-    is_step = x.is_cuda and x.dtype == torch.bfloat16 and len(x) == 1 and width in WIDTHS
-    return is_step and has_hopper(x.device, step_blocks(0, width).shared)
-
-
-def step_blocks(n_lanes: int, width: int) -> Blocks:
-    """Returns the blocks that step all lanes."""
-    n_bytes, n_parts = ACTING.constants, width // _UNITS
-    of_state = _LANES * n_bytes["STATE_BYTES"] + n_bytes["BIAS_BYTES"]
-    n_blocks = -(-n_lanes // _LANES) * width // _UNITS
-    return Blocks(n_blocks, 1, _THREADS, n_parts * n_bytes["PART_BYTES"] + of_state)
-
-
-def step(x, weight, bias, reset, start, is_residual) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns outputs (1, B, W) bfloat16 and state (B, W) float32 after a step, without what its
-    gradient needs. Gates are float32 sums, rounded to bfloat16 after the bias.
-    """
-    x, start = aligned(x), aligned(start)
-    outputs, last, (n_lanes, width) = torch.empty_like(x), torch.empty_like(start), start.shape
-    launch(
-        *(ACTING, f"mingru_step_{width}", x.device, step_blocks(n_lanes, width)),
-        **dict(x=x, weight=aligned(weight), bias=aligned(bias), reset=reset.contiguous()),
-        **dict(start=start, outputs=outputs, last=last),
-        **dict(n_lanes=n_lanes, is_residual=int(is_residual)),
-    )
-    return outputs, last
-
-
 # ---- Product and recurrence ----
 
 
@@ -195,8 +148,8 @@ class _Sequence(torch.autograd.Function):
         x, reset, start = aligned(x), reset.contiguous(), aligned(start)
         weight, bias = cast(weight, x.dtype), cast(bias, x.dtype)
         needs_backward = has_grad and any(ctx.needs_input_grad)
-        if not needs_backward and fits_step(x):
-            return step(x, weight, bias, reset, start, is_residual)
+        if not needs_backward and step.fits(step.MINGRU, x, x.dtype):
+            return step.step(step.MINGRU, x, weight, bias, reset, start, is_residual)[:2]
         gates, residual = product(x, weight, bias), x if is_residual else None
         has_states = is_residual and needs_backward
         outputs, last, states = recurrence(gates, reset, start, residual, has_states)

@@ -11,7 +11,7 @@ from torch import nn
 
 from megastep import engine
 from megastep.agents.networks import lstm as lstm_module
-from megastep.agents.networks.fused import aligned, launch_units, plain_operations
+from megastep.agents.networks.fused import aligned, plain_operations
 from megastep.agents.networks.lstm import LSTM, ON_CLUSTERS, ON_CPU, WIDTHS
 from megastep.arrdict import arrdict
 from tests.helpers.recurrent import assert_close
@@ -116,15 +116,6 @@ def test_wrong_shapes_raise():
 # ---- The kernels ----
 
 
-@pytest.fixture(params=["compiled", pytest.param("cuda", marks=pytest.mark.cuda)])
-def where(request, monkeypatch):
-    """Device of the kernels: a GPU, or the CPU with kernels compiled for it."""
-    if request.param == "cuda":
-        return "cuda"
-    request.getfixturevalue("cuda_on_cpu").install(monkeypatch)
-    return "cpu"
-
-
 def sequence(form, device, dtype, x, reset, state, weights, d_outputs, d_cell, is_residual=False):
     """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU.
 
@@ -159,55 +150,6 @@ def test_aligned_is_contiguous_in_16_byte_words(offset, shape):
         copied = aligned(source)
         assert torch.equal(copied, source)
         assert copied.is_contiguous() and not copied.data_ptr() % 16
-
-
-@pytest.mark.parametrize("dtype", SLACK, ids=str)
-@pytest.mark.parametrize("is_residual", [False, True])
-@pytest.mark.parametrize("n_lanes, width", [(5, 16), (3, 7), (40, 256)])
-@torch.no_grad()
-def test_acting_matches_a_sequence_of_one_step(where, dtype, is_residual, n_lanes, width):
-    torch.manual_seed(0)
-    lstm, x = LSTM(width), torch.randn(1, n_lanes, width).bfloat16().float()
-    reset = torch.arange(n_lanes)[None] % 3 == 1
-    state = arrdict({key: torch.randn(n_lanes, width) for key in ("output", "cell")})
-    with plain_operations():
-        expected, expected_after = lstm(x, reset, state, is_residual)
-    state.output[1] = torch.nan  # cleared by the reset
-    state.cell[1] = torch.nan
-    with torch.autocast(where, torch.bfloat16, enabled=dtype == torch.bfloat16):
-        inputs = x.to(where), reset.to(where), state.to(where), is_residual
-        result, after = lstm_module._act_on_gpu(lstm.to(where), *inputs)
-    assert result.dtype == dtype and after.output.dtype == after.cell.dtype == torch.float32
-    results = [leaf.float().cpu() for leaf in (result, after.output, after.cell)]
-    expected = expected, expected_after.output, expected_after.cell
-    assert_close(("outputs", "output", "cell"), results, expected, SLACK[dtype])
-    if not is_residual:
-        assert torch.equal(results[0][0], results[1])
-
-
-@pytest.mark.parametrize("width", [4, 3])
-def test_gates_saturate_and_nan_propagates(where, width):
-    """All gates of a lane have the same value before their activation."""
-    inf, nan = torch.inf, torch.nan
-    values = torch.tensor([-inf, -1e30, -100.0, -20.0, 0.0, 20.0, 100.0, 1e30, inf, nan])
-    gates = values[:, None].expand(-1, 4 * width).contiguous().to(where)
-    cell = torch.full((len(values), width), 0.5, device=where)
-    output, same, after = (torch.full_like(cell, 7.0) for _ in range(3))
-    launch_units(
-        *("lstm_act", torch.float32, cell),
-        **dict(gates=gates, reset=torch.zeros(len(values), dtype=torch.bool, device=where)),
-        **dict(last_cell=cell, residual=None, output=output, next_output=same, next_cell=after),
-    )
-    sigmoid, squashed = values.double().sigmoid(), values.double().tanh()
-    cells = sigmoid * 0.5 + sigmoid * squashed
-    for result, expected in ((after, cells), (output, sigmoid * cells.tanh())):
-        torch.testing.assert_close(
-            result.cpu().double(),
-            expected[:, None].expand(-1, width),
-            rtol=0,
-            atol=1e-6,
-            equal_nan=True,
-        )
 
 
 # ---- A whole sequence in one kernel ----

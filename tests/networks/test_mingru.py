@@ -5,7 +5,6 @@ Kernels run on a GPU, and on a CPU from the same source (`tests/helpers/cuda_on_
 
 import pytest
 import torch
-from torch.nn import functional
 
 from megastep.agents.networks import mingru as mingru_module
 from megastep.agents.networks.fused import plain_operations
@@ -272,98 +271,3 @@ def test_module_matches_its_plain_form(request, monkeypatch, form, is_residual, 
     names = "outputs", "last", "d x", "d start", "d weight", "d bias"
     # TF32 rounds products to 11 bits
     assert_close(names, results, expected, 5e-3 if form == "cuda" else 1e-5)
-
-
-# ---- A step in one kernel ----
-
-
-def plain_step(x, weight, bias, reset, start, is_residual):
-    """The twin of `mingru_module.step`: float64, but for the roundings to bfloat16."""
-    inputs = (leaf.double() for leaf in (x[0], weight, bias))
-    gates = functional.linear(*inputs).bfloat16().double()
-    before = start.double().masked_fill(reset[0, :, None], 0.0)
-    last = before.lerp(gates[:, start.shape[1] :], gates[:, : start.shape[1]].sigmoid())
-    outputs = last + x[0].double() if is_residual else last
-    return outputs.to(x.dtype)[None], last.float()
-
-
-@pytest.mark.parametrize("is_residual", [False, True])
-def test_acting_takes_the_step_and_learning_does_not(monkeypatch, is_residual):
-    torch.manual_seed(0)
-    core, x, state = MinGRU(W), torch.randn(2, B, W), arrdict(output=torch.randn(B, W))
-    reset, calls = torch.rand(2, B) < 0.5, []
-
-    def step(*args):
-        calls.append(args)
-        return plain_step(*args)
-
-    monkeypatch.setattr(mingru_module, "fits_step", lambda x: len(x) == 1)
-    monkeypatch.setattr(mingru_module, "step", step)
-    results = []
-    for grad in (True, False):
-        with torch.set_grad_enabled(grad):
-            outputs, after = core(x[:1], reset[:1], state, is_residual)
-        assert outputs.requires_grad is after.output.requires_grad is grad
-        results.append((outputs, after.output))
-    assert len(calls) == 1
-    for learnt, acted in zip(*results, strict=True):
-        # gates are rounded to 8 bits
-        torch.testing.assert_close(acted, learnt, rtol=0, atol=2e-2)
-    core.requires_grad_(False)
-    core(x[:1], reset[:1], state, is_residual)  # nothing needs a gradient
-    assert len(calls) == 2
-    with torch.no_grad():
-        core(x, reset, state, is_residual)  # two steps
-    assert len(calls) == 2
-
-
-def step_inputs(n_lanes, width):
-    """Returns x (1, B, W), weight, bias, resets (1, B), and a state that is NaN there."""
-    torch.manual_seed(0)
-    x = torch.randn(1, n_lanes, width)
-    weight, bias = torch.randn(2 * width, width) / width**0.5, torch.randn(2 * width)
-    reset, start = torch.rand(1, n_lanes) < 0.3, torch.randn(n_lanes, width)
-    start[reset[0]] = torch.nan
-    return [*(leaf.bfloat16() for leaf in (x, weight, bias)), reset, start]
-
-
-def two_kernels(gates, reset, start, residual):
-    """Returns outputs and state after the step from rounded gates (1, B, 2 W)."""
-    return mingru_module._forward_on_gpu(gates, reset, start, residual)[:2]
-
-
-STEPS = pytest.mark.parametrize(
-    "n_lanes, width",
-    [(1, 256), (37, 256), (4096, 256), (5000, 256), (65_536, 64), (129, 64), (200, 128), (7, 192)],
-)
-
-
-@pytest.mark.parametrize("is_residual", [False, True])
-@pytest.mark.parametrize("n_lanes, width", [(1, 256), (129, 64), (37, 192), (20, 128)])
-def test_step_matches_the_plain_form_in_every_order(
-    cuda_on_cpu, monkeypatch, n_lanes, width, is_residual
-):
-    inputs = step_inputs(n_lanes, width)
-    expected = plain_step(*inputs, is_residual)
-    cuda_on_cpu.install(monkeypatch)
-    results = cuda_on_cpu.in_every_order(lambda: mingru_module.step(*inputs, is_residual))
-    assert_close(("outputs", "last"), results, expected, SLACK[torch.bfloat16])
-    assert cuda_on_cpu.launched == {f"mingru_step_{width}"}
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("is_residual", [False, True])
-@STEPS
-def test_step_matches_the_plain_form_and_is_repeatable(n_lanes, width, is_residual):
-    x, weight, bias, reset, start = inputs = [leaf.cuda() for leaf in step_inputs(n_lanes, width)]
-    names, results = ("outputs", "last"), mingru_module.step(*inputs, is_residual)
-    again = mingru_module.step(*inputs, is_residual)
-    assert all(map(torch.equal, results, again))
-    slack = SLACK[torch.bfloat16]  # sums in another order round some gates to the next number
-    assert_close(names, results, plain_step(*inputs, is_residual), slack)
-    gates = functional.linear(x, weight, bias)
-    by_two = two_kernels(gates, reset, start, x if is_residual else None)
-    assert_close(names, results, by_two, slack)
-    for result, other in zip(results, by_two, strict=True):
-        # below the rounding of all gates to 8 bits
-        assert (result.float() - other.float()).norm() < 4e-3 * other.float().norm()

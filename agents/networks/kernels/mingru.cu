@@ -50,30 +50,26 @@ DEVICE void load(MingruForwardInput<T, N>& input, const MingruForwardParams& p,
         load(input.residual, p.residual, unit_at(p, index, t));
 }
 
-// IS_STEP: the sequence is one step. That takes fewer than 33 registers, so that a multiprocessor
-// runs as many threads as it can.
-template <bool IS_STEP>
 struct MingruForward {
-    static constexpr int N_GATES = 2, AHEAD = IS_STEP ? 1 : STEPS_AHEAD;
+    static constexpr int N_GATES = 2;
 
     template <class T, int N>
     DEVICE void run(const MingruForwardParams& p, const UnitIndex& index) {
-        int n_steps = IS_STEP ? 1 : p.n_steps;
+        int n_steps = p.n_steps;
         float state[N];
-        MingruForwardInput<T, N> inputs[AHEAD];
+        MingruForwardInput<T, N> inputs[STEPS_AHEAD];
 #pragma unroll
-        for (int i = 0; i < AHEAD; i++)
+        for (int i = 0; i < STEPS_AHEAD; i++)
             load(inputs[i], p, index, min(i, n_steps - 1));
         read<float>(state, p.start, index.unit);
-        for (int first = 0; first < n_steps; first += AHEAD) {
+        for (int first = 0; first < n_steps; first += STEPS_AHEAD) {
 #pragma unroll
-            for (int i = 0; i < AHEAD; i++) {
+            for (int i = 0; i < STEPS_AHEAD; i++) {
                 int t = first + i;
                 if (t >= n_steps)
                     break;
                 step(p, unit_at(p, index, t), inputs[i], state);
-                if (!IS_STEP)
-                    load(inputs[i], p, index, min(t + AHEAD, n_steps - 1));
+                load(inputs[i], p, index, min(t + STEPS_AHEAD, n_steps - 1));
             }
         }
         write<float>(p.last, index.unit, state);
@@ -223,10 +219,7 @@ DEVICE void backward(const MingruBackwardParams& p) {
         backward<T, 1>(p);
 }
 
-INSTANCE(BOUNDS(64) mingru_step_float32, MingruForwardParams, run<MingruForward<true>, float>)
-INSTANCE(BOUNDS(64) mingru_step_bfloat16, MingruForwardParams, run<MingruForward<true>, Bfloat16>)
-INSTANCE(BOUNDS(64) mingru_forward_float32, MingruForwardParams, run<MingruForward<false>, float>)
-INSTANCE(BOUNDS(64) mingru_forward_bfloat16, MingruForwardParams,
-         run<MingruForward<false>, Bfloat16>)
+INSTANCE(BOUNDS(64) mingru_forward_float32, MingruForwardParams, run<MingruForward, float>)
+INSTANCE(BOUNDS(64) mingru_forward_bfloat16, MingruForwardParams, run<MingruForward, Bfloat16>)
 INSTANCE(BOUNDS(256) mingru_backward_float32, MingruBackwardParams, backward<float>)
 INSTANCE(BOUNDS(256) mingru_backward_bfloat16, MingruBackwardParams, backward<Bfloat16>)

@@ -84,6 +84,3 @@ DEVICE void write(void* base, long long index, const float (&values)[N]) {
 
 // For large |x| the exponential is 0 or infinite and the quotient 1 or 0. NaN stays NaN.
 DEVICE float sigmoid(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
-
-// Absolute error below 3e-7.
-DEVICE float tanh_of(float x) { return 1.f - 2.f * sigmoid(-2.f * x); }

@@ -3,32 +3,6 @@
 // T steps, B lanes, W units. "compute" is the dtype of matrix products, float32 or bfloat16.
 #pragma once
 
-// A step of the LSTM, acting. Gates are before activation, in the order input, forget, candidate,
-// output.
-
-struct LstmJoinParams {
-    const unsigned char* reset;  // (B)
-    const void* x;               // (B, W) compute
-    const float* last_output;    // (B, W)
-    void* joined;                // (B, 2 W) compute: x, then the last output
-    int n_lanes;
-    int width;
-    int n_units;  // units per thread
-};
-
-struct LstmActParams {
-    const void* gates;           // (B, 4 W) compute
-    const unsigned char* reset;  // (B)
-    const float* last_cell;      // (B, W)
-    const void* residual;        // (B, W) compute, added to `output`; null: nothing is
-    void* output;                // (B, W) compute
-    float* next_output;          // (B, W), the same numbers without the residual
-    float* next_cell;            // (B, W)
-    int n_lanes;
-    int width;
-    int n_units;  // units per thread
-};
-
 // The minGRU. Gates are the update gate before activation, and the candidate. `start` is the state
 // before the first step, `last` the state after the last.
 
@@ -93,8 +67,8 @@ struct NormaliseParams {
 struct MomentsParams {
     IntakeLeafParams leaves[8];       // (B, n_features), without mean and scale
     const unsigned char* is_counted;  // (B)
-    float* moments;                   // of each leaf (2, n_features / group): means, then variances
-    long long* n_counted;             // ()
+    float* parts;                     // (n_statistics, n_parts, 3): lanes that count, mean, and
+                                      // squares of what is beside it, per number of a lane
     int n_lanes;
 };
 
@@ -142,7 +116,7 @@ struct MaskedPartsParams {
 
 struct MaskedMomentsParams {
     const float* parts;  // (n_arrays, n_parts, 3)
-    float* moments;      // (n_arrays, 2), means and variances
+    float* moments;      // (2, n_arrays), means and variances
     long long* n_valid;  // ()
     int n_parts;
 };
@@ -194,25 +168,15 @@ struct CategoricalActParams {
     int n_choices;  // at most ACT_THREADS
 };
 
-struct CategoricalTermsParams {
-    const float* logits;       // (n_rows, A, n), log-probabilities
-    const long long* actions;  // (n_rows, A)
-    float* logprobs;           // (n_rows), of the joint actions, or their gradient
-    float* entropies;          // (n_rows), or their gradient
-    float* d_logits;           // (n_rows, A, n) in the backward pass, else null
-    int n_rows;
-    int n_agents;
-    int n_choices;
-};
-
 // The heads of an update. A row of their product has the prediction, the actions' scores, and the
-// critic's hidden layer of W units before its ReLU, each padded to a multiple of 8.
+// critic's hidden layer of W units before its ReLU, each padded to a multiple of 8. W = 8 without
+// such a layer: then the value is the first of these columns.
 struct HeadsForwardParams {
     const void* product;        // (n_rows, n_columns) bfloat16
     const void* target;         // (n_rows, n_predicted, padded) bfloat16, of the prediction
     const long long* actions;   // (n_rows, A)
-    const float* value_weight;  // (W)
-    const float* value_bias;    // ()
+    const float* value_weight;  // (W); null: there is no hidden layer
+    const float* value_bias;    // (); null: 0
     const float* value_scale;   // ()
     const float* value_mean;    // ()
     float* logprobs;            // (n_rows), of the joint actions; null: not wanted

@@ -1,16 +1,21 @@
 // The parameters of each launch, passed by value; see megastep/kernels/params.h.
-// B lanes, W units.
+// B lanes, W units, a multiple of 64.
 #pragma once
 
-// One step of the minGRU. `start` is the state before it, `last` the state after it.
-struct MingruStepParams {
+// One step of the minGRU (G = 2 gates: update, candidate) or of the LSTM (G = 4: input, forget,
+// candidate, output). The inner axis of the weights has K = W numbers, those of x, or K = 2 W,
+// those of x and of the last output.
+struct StepParams {
     const void* x;               // (B, W) bfloat16
-    const void* weight;          // (2 W, W) bfloat16: of the update gate, then of the candidate
-    const void* bias;            // (2 W) bfloat16
+    const void* last_output;     // (B, W) bfloat16; null: the minGRU
+    const void* weight;          // (G W, K) bfloat16
+    const void* bias;            // (G W) bfloat16
     const unsigned char* reset;  // (B)
-    const float* start;          // (B, W)
+    const float* last_state;     // (B, W) the minGRU's state, or the LSTM's cell
     void* outputs;               // (B, W) bfloat16
-    float* last;                 // (B, W)
+    void* next_output;           // (B, W) bfloat16, without the residual; null: the minGRU
+    float* next_state;           // (B, W)
     int n_lanes;                 // B
+    int width;                   // W
     int is_residual;             // 1: adds x to `outputs`. 0: does not
 };

@@ -4,6 +4,3 @@ constexpr int MAX_ROWS = 2048;     // of a product; of more, larger blocks are f
 constexpr int TILE = 64;           // rows and columns of a block's results
 constexpr int TILE_THREADS = 128;  // of a block
 constexpr int TILE_BYTES = 36864;  // of a block's shared memory
-constexpr int STEP_LANES = 64;     // of a block that steps the LSTM
-constexpr int STEP_UNITS = 8;      // of such a block
-constexpr int STEP_THREADS = 128;  // of such a block

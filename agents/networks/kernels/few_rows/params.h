@@ -16,18 +16,3 @@ struct ProductParams {
     int result_stride;
     int has_relu;
 };
-
-// A step of the LSTM: B lanes, W units. Gates are in the order input, forget, candidate, output.
-struct LstmStepParams {
-    const void* x;               // (B, W) bfloat16
-    const void* weight;          // (4 W, 2 W) bfloat16: of x, then of the last output
-    const void* bias;            // (4 W) bfloat16
-    const unsigned char* reset;  // (B)
-    const float* last_output;    // (B, W)
-    const float* last_cell;      // (B, W)
-    void* output;                // (B, W) bfloat16
-    float* next_output;          // (B, W), the same numbers without the residual
-    float* next_cell;            // (B, W)
-    int n_lanes;                 // B
-    int is_residual;             // 1: adds x to `output`. 0: does not
-};
