@@ -124,7 +124,9 @@ class ValueOutput(nn.Module):
 
 
 class _Sizes(NamedTuple):
-    """The columns of the product of heads. Values alone have only those of the hidden layer."""
+    """The columns of the product of heads. Values alone have only those of the hidden layer. A
+    plain critic has a word with its value in place of that layer.
+    """
 
     n_predicted: int = 0  # F
     n_agents: int = 0
@@ -154,10 +156,13 @@ def _launch_heads(columns, value, sizes, **fields) -> None:
     )
 
 
-def _value_parameters(output) -> dict[str, torch.Tensor]:
-    weight, bias = (leaf.detach() for leaf in output.linear.parameters())
+def _value_parameters(output, has_hidden=True) -> dict[str, torch.Tensor | None]:
+    weight, bias = None, None
+    if has_hidden:
+        weight, bias = (leaf.detach() for leaf in output.linear.parameters())
+        weight = aligned(weight)
     statistics = dict(value_scale=output.scale, value_mean=output.mean)
-    return dict(value_weight=aligned(weight), value_bias=bias, **statistics)
+    return dict(value_weight=weight, value_bias=bias, **statistics)
 
 
 def _are_few_words(x) -> bool:
@@ -225,7 +230,8 @@ class Critic(nn.Module):
 
 class _JointHeads(torch.autograd.Function):
     """Weights of what reads the features, one above the other, make one product (rows, columns).
-    Its gradient is one tensor, too, so that those of the features need no sum.
+    Its gradient is one tensor, too, so that those of the features need no sum. A plain critic has
+    neither a target nor privileged observations.
     """
 
     @staticmethod
@@ -233,18 +239,21 @@ class _JointHeads(torch.autograd.Function):
         ctx, sizes, value, target, actions, features, privileged, *parameters
     ) -> tuple[torch.Tensor, ...]:
         lead, dtype = features.shape[:-1], features.dtype
-        features, privileged, target = (
-            aligned(leaf.flatten(0, -2)) for leaf in (features, privileged, target)
-        )
-        actions = aligned(actions.flatten(0, -2).long())
-        weights = [cast(weight, dtype, _MULTIPLE) for weight in parameters[:6:2]]
-        biases = [cast(bias, dtype, _MULTIPLE) for bias in parameters[1:6:2]]
-        of_features, of_privileged = weights[2].split(sizes.width, 1)
-        weight = torch.cat([*weights[:2], of_features])
+        features, actions = aligned(features.flatten(0, -2)), aligned(actions.flatten(0, -2).long())
+        names, is_plain = ["logprobs", "entropies", "values"], privileged is None
+        of_features = parameters if is_plain else parameters[:6]
+        weights = [cast(weight, dtype, _MULTIPLE) for weight in of_features[::2]]
+        biases = [cast(bias, dtype, _MULTIPLE) for bias in of_features[1::2]]
+        of_privileged = None
+        if not is_plain:
+            names.append("errors")
+            privileged, target = (aligned(leaf.flatten(0, -2)) for leaf in (privileged, target))
+            weights[2], of_privileged = weights[2].split(sizes.width, 1)
+        weight = torch.cat(weights)
         columns = product(features, weight, torch.cat(biases))
-        product(privileged, of_privileged, None, onto=columns[:, sizes.first_hidden :])
-        results = columns.new_empty(4, len(columns), dtype=torch.float32).unbind()
-        names = "logprobs", "entropies", "errors", "values"
+        if of_privileged is not None:
+            product(privileged, of_privileged, None, onto=columns[:, sizes.first_hidden :])
+        results = columns.new_empty(len(names), len(columns), dtype=torch.float32).unbind()
         inputs = dict(target=target, actions=actions)
         _launch_heads(columns, value, sizes, **inputs, **dict(zip(names, results, strict=True)))
         ctx.sizes = sizes
@@ -265,46 +274,58 @@ class _JointHeads(torch.autograd.Function):
         d = torch.empty_like(columns)
         sum_sizes = n_columns, sizes.width, _MULTIPLE
         sums = columns.new_empty(n_strips, sum(sum_sizes), dtype=torch.float32)
-        names = "d_logprobs", "d_entropies", "d_errors", "d_values"
+        names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         launch(
             *(LIBRARY, "heads_backward", columns.device),
             Blocks(n_strips * n_parts, threads=_STRIP_THREADS),
             **dict(product=columns, target=target, actions=actions),
             **dict(value_weight=value_weight, value_scale=value_scale),
-            **dict(zip(names, (each.contiguous() for each in gradients), strict=True)),
+            **{**dict.fromkeys(names), **dict(zip(names, (d.contiguous() for d in gradients)))},
             **dict(d_product=d, sums=sums, n_rows=n_rows, **sizes._asdict()),
         )
         d_biases, d_value_weight, d_value_bias = sum_rows(sums).split(sum_sizes)
-        first_hidden = sizes.first_hidden
-        d_hidden, d_weight = d[:, first_hidden:], gradient_of_weights(d, features)
-        d_of_privileged = gradient_of_weights(d_hidden, privileged)
+        d_weight, first_hidden = gradient_of_weights(d, features), sizes.first_hidden
+        d_features = gradient_of_inputs(d, weight).unflatten(0, lead)
         n_scores = sizes.n_agents * sizes.n_choices
         scores = slice(sizes.first_score, sizes.first_score + n_scores)
+        d_scores = d_weight[scores], d_biases[scores]
+        if privileged is None:
+            value = slice(first_hidden, first_hidden + 1)
+            d_value = d_weight[value], d_biases[value]
+            return *(None, None, None, None), d_features, None, *d_scores, *d_value
+        d_hidden = d[:, first_hidden:]
+        d_of_privileged = gradient_of_weights(d_hidden, privileged)
         return (
-            *(None, None, None, None),
-            gradient_of_inputs(d, weight).unflatten(0, lead),
+            *(None, None, None, None, d_features),
             gradient_of_inputs(d_hidden, of_privileged).unflatten(0, lead),
-            *(d_weight[: sizes.n_predicted], d_biases[: sizes.n_predicted]),
-            *(d_weight[scores], d_biases[scores]),
+            *(d_weight[: sizes.n_predicted], d_biases[: sizes.n_predicted], *d_scores),
             *(torch.cat([d_weight[first_hidden:], d_of_privileged], 1), d_biases[first_hidden:]),
             *(d_value_weight[None], d_value_bias[:1]),
         )
 
 
 def _terms_on_gpu(output, critic, prediction, features, encoded, actions, mask=None) -> Terms:
-    n_agents, n_choices = output.shape
-    sizes = _Sizes(len(prediction.weight), n_agents, n_choices, features.shape[-1])
-    inputs = features, linear(encoded, critic.intake.project, critic.intake.activation)
-    layers = prediction, output.linear, critic.hidden, critic.output.linear
+    (n_agents, n_choices), has_hidden = output.shape, critic.is_asymmetric
+    layers, sizes = [output.linear], _Sizes(0, n_agents, n_choices, _MULTIPLE)
+    target = privileged = None
+    if has_hidden:
+        layers = [prediction, output.linear, critic.hidden]
+        sizes = _Sizes(len(prediction.weight), n_agents, n_choices, features.shape[-1])
+        target, intake = encoded.detach(), critic.intake
+        privileged = linear(encoded, intake.project, intake.activation)
+    layers.append(critic.output.linear)
     parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
-    value = _value_parameters(critic.output)
-    return _JointHeads.apply(sizes, value, encoded.detach(), actions, *inputs, *parameters)
+    inputs = _value_parameters(critic.output, has_hidden), target, actions, features, privileged
+    logprobs, entropies, values, *errors = _JointHeads.apply(sizes, *inputs, *parameters)
+    return logprobs, entropies, errors[0] if errors else None, values
 
 
 def _fits_joint(output, critic, prediction, features, encoded, actions, mask=None) -> bool:
-    if prediction is None or mask is not None or type(output) is not MultiDiscreteOutput:
+    is_known = type(output) is MultiDiscreteOutput and mask is None
+    if not is_known or critic.is_asymmetric != (prediction is not None):
         return False
-    is_bf16 = features.is_cuda and features.dtype == encoded.dtype == torch.bfloat16
+    is_bf16 = features.is_cuda and features.dtype == torch.bfloat16
+    is_bf16 = is_bf16 and (encoded is None or encoded.dtype == torch.bfloat16)
     is_float32 = critic.output.linear.weight.dtype == torch.float32
     return is_bf16 and is_float32 and _are_few_words(features)
 

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable, Mapping
 
 import torch
 from torch import nn
-from torch.autograd.function import once_differentiable
 
 from megastep import spaces
 from megastep.agents.networks.fused import DTYPES, LIBRARY, fused
@@ -150,33 +149,6 @@ def _acts_on_gpu(output, x, sample=True, generator=None, mask=None) -> bool:
     return x.is_cuda and is_known and is_small and not torch.is_grad_enabled()
 
 
-class _Terms(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, logits, actions) -> tuple[torch.Tensor, ...]:
-        lead = logits.shape[:-2]
-        logits = logits.flatten(0, -3).contiguous()
-        actions = actions.flatten(0, -2).long().contiguous()
-        ctx.save_for_backward(logits, actions)
-        results = logits.new_empty(2, len(logits))
-        _launch_terms("", logits, actions, results[0], results[1], None)
-        return tuple(each.view(lead) for each in results)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, d_logprobs, d_entropies) -> tuple[torch.Tensor, None]:
-        logits, actions = ctx.saved_tensors
-        d_logits = torch.empty_like(logits)
-        of = d_logprobs.contiguous(), d_entropies.contiguous(), d_logits
-        _launch_terms("_backward", logits, actions, *of)
-        return d_logits.unflatten(0, d_logprobs.shape), None
-
-
-def _launch_terms(direction, logits, actions, logprobs, entropies, d_logits) -> None:
-    fields = dict(logits=logits, actions=actions, logprobs=logprobs, entropies=entropies)
-    fields |= dict(zip(("n_rows", "n_agents", "n_choices"), logits.shape), d_logits=d_logits)
-    launch(LIBRARY, f"categorical_terms{direction}", logits.device, len(logits), **fields)
-
-
 class MultiDiscreteOutput(Output):
     """One categorical choice out of n per agent.
 
@@ -185,10 +157,6 @@ class MultiDiscreteOutput(Output):
     """
 
     act = fused(_act_on_gpu, _acts_on_gpu)(Output.act)
-    terms = fused(
-        lambda self, logits, actions: _Terms.apply(logits, actions),
-        lambda self, logits, actions: logits.is_cuda and logits.dtype == torch.float32,
-    )(Output.terms)
 
     def __init__(self, space: spaces.MultiDiscrete, width: int):
         super().__init__()

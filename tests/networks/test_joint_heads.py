@@ -16,17 +16,19 @@ from megastep.agents.networks.fused import plain_operations
 
 BF16 = torch.bfloat16
 # rows, predicted numbers, agents, choices, width: one row; a last strip that is short, and two
-# words of hidden units per thread; more than 32 words of prediction; more choices than acting takes
+# words of hidden units per thread; more than 32 words of prediction; more choices than acting
+# takes; plain critics, without a prediction
 CASES = [(1, 3, 1, 7, 8), (300, 52, 2, 5, 264), (129, 300, 1, 7, 64), (1000, 8, 3, 12, 256)]
+CASES += [(1, 0, 1, 7, 8), (300, 0, 2, 5, 264)]
 
 
 def modules(n_predicted, n_agents, n_choices, width):
     """Returns an output, a critic and a prediction, with weights far from 0."""
     output = heads.output(spaces.MultiDiscrete(n_agents, n_choices), width)
-    critic = Critic(width, spaces.MultiVector(1, n_predicted))
-    prediction = torch.nn.Linear(width, n_predicted)
+    critic = Critic(width, spaces.MultiVector(1, n_predicted) if n_predicted else None)
+    prediction = torch.nn.Linear(width, n_predicted) if n_predicted else None
     for module in (output, critic, prediction):
-        for leaf in module.parameters():
+        for leaf in module.parameters() if module else ():
             torch.nn.init.normal_(leaf, std=leaf.shape[-1] ** -0.5)
             leaf.data = leaf.data.bfloat16().float()
     critic.output.scale.fill_(2.5)
@@ -60,24 +62,31 @@ def test_terms_and_gradients_match_pytorch(
 ):
     torch.manual_seed(0)
     plain = modules(n_predicted, n_agents, n_choices, width)
-    features, n_columns = torch.randn(n_rows, width).to(BF16), plain[1].intake.project.in_features
-    encoded = torch.randn(n_rows, n_columns).to(BF16)
+    features, encoded = torch.randn(n_rows, width).to(BF16), None
+    if n_predicted:
+        encoded = torch.randn(n_rows, plain[1].intake.project.in_features).to(BF16)
     actions = torch.randint(n_choices, (n_rows, n_agents))
     weights = torch.randn(4, n_rows)
     results = []
     for is_fused in (True, False):
         if is_fused:
-            of = [moved(module, to_gpu) for module in plain]
-            x, *others = (to_gpu(leaf) for leaf in (features, encoded, actions))
+            of = [module and moved(module, to_gpu) for module in plain]
+            x, *others = (
+                leaf if leaf is None else to_gpu(leaf) for leaf in (features, encoded, actions)
+            )
             x.requires_grad_()
             with torch.autocast(x.device.type, BF16):
+                assert critic_module._fits_joint(*of, x, *others) == x.is_cuda
                 terms = critic_module._terms_on_gpu(*of, x, *others)
         else:
             of, x = plain, features.float().requires_grad_()
             with plain_operations():
-                terms = critic_module.head_terms(*of, x, encoded.float(), actions)
-        loss = sum((w.to(term.device) * term).sum() for w, term in zip(weights, terms))
-        leaves = [x, *(leaf for module in of for leaf in module.parameters())]
+                target = None if encoded is None else encoded.float()
+                terms = critic_module.head_terms(*of, x, target, actions)
+        loss = sum(
+            (w.to(x.device) * term).sum() for w, term in zip(weights, terms) if term is not None
+        )
+        leaves = [x, *(leaf for module in of if module for leaf in module.parameters())]
         d = torch.autograd.grad(loss, leaves, allow_unused=True)
         results.append([*terms, *d])
     for i, (ours, theirs) in enumerate(zip(*results, strict=True)):

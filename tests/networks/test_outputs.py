@@ -177,26 +177,6 @@ def test_actions_are_those_of_the_plain_form(to_gpu, n_lanes, shape):
         torch.testing.assert_close(logprobs, plain[2])
 
 
-def test_terms_match_the_plain_form(to_gpu):
-    torch.manual_seed(0)
-    output = heads.output(spaces.MultiDiscrete(2, 7), 8)
-    logits = torch.randn(9, 33, 2, 7).log_softmax(-1).requires_grad_()
-    actions = torch.randint(7, (9, 33, 2))
-    plain = output.logprob(logits, actions), output.entropy(logits)
-    on_gpu = to_gpu(logits.detach().clone()).requires_grad_()
-    fused = output.terms(on_gpu, to_gpu(actions))
-    weights = torch.randn(2, 9, 33)
-    for one, other in zip(fused, plain, strict=True):
-        torch.testing.assert_close(one.cpu(), other)
-    losses = [
-        sum((w.to(x.device) * x).sum() for w, x in zip(weights, terms)) for terms in (fused, plain)
-    ]
-    (d_fused,), (d_plain,) = (
-        torch.autograd.grad(loss, leaf) for loss, leaf in zip(losses, (on_gpu, logits))
-    )
-    torch.testing.assert_close(d_fused.cpu(), d_plain)
-
-
 # rows, features, agents, choices; from 264 features on, a thread reads several words
 CASES = [(7, 8, 1, 8), (300, 256, 1, 7), (129, 264, 2, 3), (257, 64, 8, 1), (130, 520, 2, 4)]
 DUELS = pytest.mark.parametrize("n_rows, width, n_agents, n_choices", CASES)

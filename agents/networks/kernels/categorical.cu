@@ -1,5 +1,4 @@
-// Categorical actions: choosing them when acting, ACT_THREADS threads per lane; log-probability and
-// entropy when learning, and their gradients, one thread per row.
+// Choosing categorical actions, ACT_THREADS threads per lane.
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -88,35 +87,3 @@ DEVICE void act(const CategoricalActParams& p) {
 
 INSTANCE(BOUNDS(64) categorical_act_float32, CategoricalActParams, act<float>)
 INSTANCE(BOUNDS(64) categorical_act_bfloat16, CategoricalActParams, act<Bfloat16>)
-KERNEL BOUNDS(64) categorical_terms(CategoricalTermsParams p) {
-    wait_for_previous();
-    int row = blockIdx.x * blockDim.x + threadIdx.x;
-    if (row >= p.n_rows)
-        return;
-    float logprob = 0.f, entropy = 0.f;
-    for (int agent = 0; agent < p.n_agents; agent++) {
-        long long first = (long long)row * p.n_agents + agent;
-        const float* logits = p.logits + first * p.n_choices;
-        logprob += logits[p.actions[first]];
-        for (int k = 0; k < p.n_choices; k++)
-            entropy -= expf(logits[k]) * logits[k];
-    }
-    p.logprobs[row] = logprob;
-    p.entropies[row] = entropy;
-}
-
-KERNEL BOUNDS(64) categorical_terms_backward(CategoricalTermsParams p) {
-    wait_for_previous();
-    int row = blockIdx.x * blockDim.x + threadIdx.x;
-    if (row >= p.n_rows)
-        return;
-    float d_logprob = p.logprobs[row], d_entropy = p.entropies[row];
-    for (int agent = 0; agent < p.n_agents; agent++) {
-        long long first = (long long)row * p.n_agents + agent;
-        const float* logits = p.logits + first * p.n_choices;
-        float* d_logits = p.d_logits + first * p.n_choices;
-        for (int k = 0; k < p.n_choices; k++)
-            d_logits[k] = (p.actions[first] == k ? d_logprob : 0.f) -
-                          d_entropy * expf(logits[k]) * (logits[k] + 1.f);
-    }
-}

@@ -1,8 +1,9 @@
 // The heads of an update, from one product of the features with the weights of all of them: the
 // log-probability of the actions and the entropy, the value, the error of the auxiliary prediction,
 // and the gradient of that product. A row of the product has the prediction, the scores of the
-// actions, and the critic's hidden layer before its ReLU, each padded to a multiple of 8. Blocks
-// are strips of rows.
+// actions, and the critic's hidden layer before its ReLU, each padded to a multiple of 8. A plain
+// critic, whose last layer has no weight here, has its value in place of that layer. Blocks are
+// strips of rows.
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -20,6 +21,19 @@ DEVICE void read_word(float (&values)[WORD], const float* from) {
         values[n] = first[n];
         values[4 + n] = last[n];
     }
+}
+
+// The weights of the value of a word of hidden units, or of the word with a plain critic's value.
+DEVICE void read_value_weight(float (&weight)[WORD], const float* from, int column) {
+    if (from)
+        return read_word(weight, from + column);
+    for (int n = 0; n < WORD; n++)
+        weight[n] = column || n ? 0.f : 1.f;
+}
+
+// Whether the ReLU, which a plain critic has not, clears a hidden unit.
+DEVICE bool is_cleared(float hidden, const float* value_weight) {
+    return hidden <= 0.f && value_weight;
 }
 
 struct Softmax {
@@ -84,9 +98,9 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
         for (int column = WORD * part; column < p.width; column += 8 * WORD) {
             float hidden[WORD], weight[WORD];
             read<Bfloat16>(hidden, columns, first_hidden + column);
-            read_word(weight, p.value_weight + column);
+            read_value_weight(weight, p.value_weight, column);
             for (int n = 0; n < WORD; n++)
-                value += hidden[n] <= 0.f ? 0.f : hidden[n] * weight[n];
+                value += is_cleared(hidden[n], p.value_weight) ? 0.f : hidden[n] * weight[n];
         }
         for (int column = WORD * part; column < p.n_predicted; column += 8 * WORD) {
             float predicted[WORD], expected[WORD];
@@ -101,7 +115,8 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
         error = sum_of_eight(error);
         if (part || start + i >= p.n_rows)
             continue;
-        p.values[row] = (value + *p.value_bias) * *p.value_scale + *p.value_mean;
+        value += p.value_bias ? *p.value_bias : 0.f;
+        p.values[row] = value * *p.value_scale + *p.value_mean;
         if (p.errors)
             p.errors[row] = error / (float)p.n_predicted;
     }
@@ -162,7 +177,8 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
                 int target = is_score ? 0 : column;
                 if (index.first_score)
                     read<Bfloat16>(expected[i], p.target, row * index.first_score + target);
-                d_errors[i] = p.d_errors[row] * 2.f / (float)p.n_predicted;
+                d_errors[i] =
+                    index.first_score ? p.d_errors[row] * 2.f / (float)p.n_predicted : 0.f;
             }
 #pragma unroll
             for (int i = 0; i < AT_ONCE; i++) {
@@ -191,7 +207,7 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     Strip strip = find_strip(index.strip, min(p.width / WORD - first_word, WARP), p.n_rows);
     int column = WORD * (first_word + strip.word);
     float weight[WORD], sums[WORD], weight_sums[WORD], bias_sum[1];
-    read_word(weight, p.value_weight + column);
+    read_value_weight(weight, p.value_weight, column);
     clear(sums);
     clear(weight_sums);
     clear(bias_sum);
@@ -212,7 +228,7 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
                 break;
             bias_sum[0] += d_values[i];
             for (int n = 0; n < WORD; n++) {
-                bool is_off = hidden[i][n] <= 0.f;
+                bool is_off = is_cleared(hidden[i][n], p.value_weight);
                 weight_sums[n] += is_off ? 0.f : d_values[i] * hidden[i][n];
                 hidden[i][n] = is_off ? 0.f : d_values[i] * weight[n];
                 sums[n] += hidden[i][n];
@@ -224,6 +240,8 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     }
     float* target = index.sums + WORD * first_word;
     add_up(sums, strip, target + index.first_hidden, WORD * strip.words);
+    if (!p.value_weight)
+        return;
     add_up(weight_sums, strip, target + index.n_columns, WORD * strip.words);
     if (!part)
         add_up(bias_sum, strip, index.sums + index.n_columns + p.width, 1);

@@ -27,8 +27,15 @@ DEVICE Strip find_strip(int strip, int words, int n_rows) {
 
 // Adds up all threads' sums and writes the first n_columns. All threads of the block take part.
 template <int N>
-DEVICE void add_up(const float (&sums)[N], const Strip& strip, float* target, int n_columns) {
+DEVICE void add_up(float (&sums)[N], const Strip& strip, float* target, int n_columns) {
     __shared__ float of_warps[STRIP_WARPS][N * WARP];
+    int groups = strip.groups;
+    if (groups * strip.words == WARP) {  // a power of two each
+        for (int mask = WARP / 2; mask >= strip.words; mask /= 2)
+            for (int n = 0; n < N; n++)
+                sums[n] += __shfl_xor_sync(~0u, sums[n], mask);
+        groups = 1;
+    }
     __syncthreads();  // an earlier call may still be reading
     for (int n = 0; n < N; n++)
         of_warps[threadIdx.x / WARP][N * (threadIdx.x % WARP) + n] = sums[n];
@@ -36,7 +43,7 @@ DEVICE void add_up(const float (&sums)[N], const Strip& strip, float* target, in
     for (int column = threadIdx.x; column < n_columns; column += STRIP_THREADS) {
         float total = 0.f;
         for (int warp = 0; warp < STRIP_WARPS; warp++)
-            for (int group = 0; group < strip.groups; group++)
+            for (int group = 0; group < groups; group++)
                 total += of_warps[warp][group * strip.words * N + column];
         target[column] = total;
     }
