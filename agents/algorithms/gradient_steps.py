@@ -51,6 +51,12 @@ def _fits(steps, *_) -> bool:
     return is_adam and len(steps.metrics) <= LIBRARY.constants["JUDGED_METRICS"]
 
 
+@functools.cache
+def one(device: torch.device) -> torch.Tensor:
+    """Returns the gradient () of a loss itself: a loss that gets it has nothing to scale."""
+    return torch.ones((), device=device)
+
+
 class GradientSteps:
     """Takes an optimizer's steps on some parameters. Skips steps with non-finite numbers.
 
@@ -124,7 +130,7 @@ class GradientSteps:
         parameters = self.optimizer.parameters
         for parameter in parameters:
             parameter.grad = None
-        loss.backward()
+        loss.backward(one(loss.device))
         n_valid, means = average_gradients(parameters, n_valid, [*metrics.values()])
         self.n_valid, self.metrics = n_valid.long(), dict(zip(metrics, means, strict=True))
         return self.metrics

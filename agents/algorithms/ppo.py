@@ -12,6 +12,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms import learner, returns
+from megastep.agents.algorithms.gradient_steps import one
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalise
 from megastep.agents.networks.fused import fused
@@ -60,8 +61,9 @@ class _Loss(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, d_loss, d_metrics) -> tuple[torch.Tensor | None, ...]:
-        # Learners differentiate the loss itself, so that d_loss is 1; others may scale it
-        gradients = torch._foreach_mul(ctx.saved_tensors, d_loss)  # pyright: ignore[reportPrivateImportUsage]
+        gradients = ctx.saved_tensors
+        if d_loss.data_ptr() != one(d_loss.device).data_ptr():
+            gradients = torch._foreach_mul(gradients, d_loss)  # pyright: ignore[reportPrivateImportUsage]
         return *gradients, *[None] * (7 - len(gradients))
 
 
@@ -176,13 +178,14 @@ class PPO(learner.ActorCritic):
             estimates["advantages"] = normalise_masked(advantages, valid, of_advantages)
         if self.value_clip is not None:
             estimates["old_value"] = transitions["value"]
+        estimates["n_valid"] = valid.sum(0, keepdim=True)  # of each lane
 
         is_enabled = True
         for _ in range(self.n_epochs):
             for lanes in self.minibatches(rollout.n_lanes):
                 parts = SEQUENCES if self.has_extra_loss else _PARTS
                 batch = rollout.sequences(lanes, parts, estimates)
-                batch["n_valid"] = batch.valid.sum()
+                batch["n_valid"] = batch.pop("n_valid").sum()
                 if self.normalise_advantage == "minibatch":
                     batch["advantages"] = pooled_normalise(batch.advantages, batch.valid)
                 loss, metrics = self._losses(rollout, lanes, batch)

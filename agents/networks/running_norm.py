@@ -26,7 +26,7 @@ UNKNOWN_SCALE = LIBRARY.constants["UNKNOWN_SCALE"]
 RESOLUTION = LIBRARY.constants["RESOLUTION"]
 #: Leaves of an observation that a kernel handles.
 MAX_LEAVES = LIBRARY.constants["MAX_LEAVES"]
-_THREADS = LIBRARY.constants["MOMENTS_THREADS"]
+_LANES, _THREADS = LIBRARY.constants["MOMENTS_LANES"], LIBRARY.constants["MOMENTS_THREADS"]
 _MAX_ARRAYS, _MASKED_THREADS, _NUMBERS = (
     LIBRARY.constants[f"MASKED_{name}"] for name in ("ARRAYS", "THREADS", "NUMBERS")
 )
@@ -82,19 +82,27 @@ def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
     device, n_lanes = leaves[0].device, len(leaves[0])
     is_counted = torch.as_tensor(is_counted, device=device).expand(n_lanes).contiguous()
     sizes = [norm.mean.numel() for norm in norms]
-    results = torch.empty(2 * sum(sizes), device=device)
-    n_counted = torch.empty((), dtype=torch.int64, device=device)
+    parts = torch.empty(sum(sizes), -(-n_lanes // _LANES), 3, device=device)
     flat = [leaf.flatten(1) for leaf in leaves]
-    launch(
-        *(LIBRARY, "moments", device, Blocks(sum(sizes), threads=_THREADS)),
-        leaves=b"".join(map(packed_leaf, norms, flat)),
-        **dict(is_counted=is_counted, moments=results, n_counted=n_counted, n_lanes=n_lanes),
-    )
-    parts = results.split([size for size in sizes for _ in range(2)])
+    blocks = Blocks(parts.shape[1], len(parts), _MASKED_THREADS)
+    leaves_of = b"".join(map(packed_leaf, norms, flat))
+    fields = dict(leaves=leaves_of, is_counted=is_counted, parts=parts, n_lanes=n_lanes)
+    launch(LIBRARY, "moments", device, blocks, **fields)
+    n_counted, moments = _merged(parts)
     means, variances = (
-        [part.view_as(norm.mean) for part, norm in zip(parts[i::2], norms)] for i in range(2)
+        [part.view_as(norm.mean) for part, norm in zip(row.split(sizes), norms)] for row in moments
     )
     return [(n_counted, *pair) for pair in zip(means, variances)]
+
+
+def _merged(parts) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the number of valid entries and means and variances (2, n) of parts (n, parts, 3)."""
+    moments = parts.new_empty(2, len(parts))
+    n_valid = torch.empty((), dtype=torch.int64, device=parts.device)
+    fields = dict(parts=parts, moments=moments, n_valid=n_valid, n_parts=parts.shape[1])
+    blocks = Blocks(1, len(parts), _MASKED_THREADS)
+    launch(LIBRARY, "masked_moments", parts.device, blocks, **fields)
+    return n_valid, moments
 
 
 @torch.no_grad()
@@ -199,15 +207,12 @@ def _masked_on_gpu(valid, *arrays) -> list[Moments]:
     n, tensor = arrays[0].numel(), arrays[0]
     n_parts = max(1, -(-n // (_MASKED_THREADS * _NUMBERS)))
     parts = tensor.new_empty(len(arrays), n_parts, 3)
-    moments = tensor.new_empty(len(arrays), 2)
-    n_valid = torch.empty((), dtype=torch.int64, device=tensor.device)
     rows = b"".join(LIBRARY.params.MaskedArrayParams(values=array) for array in arrays)
     blocks = Blocks(n_parts, len(arrays), _MASKED_THREADS)
     fields = dict(arrays=rows, valid=valid, parts=parts, n=n)
     launch(LIBRARY, "masked_parts", tensor.device, blocks, **fields)
-    fields = dict(parts=parts, moments=moments, n_valid=n_valid, n_parts=n_parts)
-    launch(LIBRARY, "masked_moments", tensor.device, blocks._replace(x=1), **fields)
-    return [(n_valid, *pair.unbind()) for pair in moments]
+    n_valid, moments = _merged(parts)
+    return [(n_valid, *pair) for pair in zip(*(row.unbind() for row in moments))]
 
 
 @torch.no_grad()

@@ -49,7 +49,7 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
     # A user's code may change actions, also inside an environment that steps on the host: there
     # they are stored before the step, elsewhere with what comes of it.
     is_ours = type(env).__module__.startswith("megastep.envs.") and optional(env, "capturable")
-    features = []
+    features = torch.empty(0)
     with policy.compute_dtype():
         seen = rollout.store_world(0, world)
         for t in range(rollout.n_steps):
@@ -58,18 +58,21 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
             decision, state = policy(seen, state)
             if not is_ours:
                 rollout.store_decision(t, decision)
+            others = []
             if rollout.values is not None:
-                features.append(decision["features"])
+                own = decision["features"]
+                features = features if t else own.new_empty(rollout.n_steps + 1, *own.shape)
+                others.append((features[t], own))
             with torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
                 world = rollout.select_lanes(world)
             layout = None if rollout.layouts is None else optional(env, "layout")
-            seen = rollout.store_outcome(t, world, layout, decision if is_ours else None)
+            stored = decision if is_ours else None
+            seen = rollout.store_outcome(t, world, layout, stored, others)
 
         if rollout.values is not None:
-            features.append(policy(seen, state, sample=False)[0]["features"])
-            values = cast("Policy", policy).value(torch.stack(features), rollout.privileged)
-            rollout.values[:] = values
+            features[-1] = policy(seen, state, sample=False)[0]["features"]
+            rollout.values[:] = cast("Policy", policy).value(features, rollout.privileged)
     # A non-finite hidden state would otherwise last until the lane's episode ends.
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
     after = arrdict(world=_stored(world), state=state)

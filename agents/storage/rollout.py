@@ -123,6 +123,7 @@ class Rollout:
         world: arrdict,
         layout: torch.Tensor | None = None,
         decision: Mapping | None = None,
+        others: Sequence[tuple[torch.Tensor, torch.Tensor]] = (),
     ) -> arrdict:
         """Stores the world after the action of time t: reward, episode end, metrics in row t, the
         observation in row t + 1. Returns `world(t + 1)`, the stored observation.
@@ -130,11 +131,12 @@ class Rollout:
         Args:
             layout: (N,) integers, the environments' layouts in that world, if they are stored.
             decision: is stored with it, as `store_decision` does.
+            others: further pairs of a target and what is copied into it.
         """
         names = "reward", "terminal", "truncated"
         pairs = [(getattr(self, name)[t], world[name]) for name in names]
         pairs += [(rows[t], world["metrics"][name]) for name, rows in self.metrics.items()]
-        pairs += self._of_world(t + 1, world)
+        pairs += [*others, *self._of_world(t + 1, world)]
         pairs += [] if decision is None else self._of_decision(t, decision)
         if layout is not None:
             n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)

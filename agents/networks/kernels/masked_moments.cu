@@ -59,8 +59,8 @@ KERNEL BOUNDS(256) masked_moments(MaskedMomentsParams p) {
     squares = sum_of_block<MASKED_THREADS>(squares);
     if (threadIdx.x)
         return;
-    p.moments[2 * blockIdx.y] = (float)mean;
-    p.moments[2 * blockIdx.y + 1] = (float)(squares / n);
+    p.moments[blockIdx.y] = (float)mean;
+    p.moments[gridDim.y + blockIdx.y] = (float)(squares / n);
     if (!blockIdx.y)
         *p.n_valid = (long long)count;
 }

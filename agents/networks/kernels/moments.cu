@@ -1,5 +1,5 @@
-// Means and variances of observations over lanes, one block per statistic; and adding them to
-// running statistics, one block per leaf.
+// Means and variances of observations over lanes, in parts that masked_moments adds up; and adding
+// them to running statistics, one block per leaf.
 #include "block_sum.h"
 #include "constants.h"
 #include "half.h"
@@ -16,14 +16,15 @@ DEVICE void add(float& sum, float x, float mean, bool is_square) {
     sum += is_square ? (x - mean) * (x - mean) : x;
 }
 
-// The sum of the numbers of a statistic, or of the squares of their distance from `mean`. A lane
-// that does not count may hold anything.
+// The sum of a part's numbers of a statistic, or of the squares of their distance from `mean`. A
+// lane that does not count may hold anything.
 template <bool is_square>
 DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int first, float mean) {
     float sum = 0.f;
     bool in_words =
         leaf.is_half && leaf.group % 8 == 0 && (unsigned long long)leaf.values % 16 == 0;
-    for (int lane = threadIdx.x; lane < p.n_lanes; lane += MOMENTS_THREADS) {
+    int start = blockIdx.x * MOMENTS_LANES, end = min(start + MOMENTS_LANES, p.n_lanes);
+    for (int lane = start + threadIdx.x; lane < end; lane += MASKED_THREADS) {
         if (!p.is_counted[lane])
             continue;
         long long at = (long long)lane * leaf.n_features + first;
@@ -43,33 +44,31 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
             for (int i = 0; i < leaf.group; i++)
                 add(sum, number_at(leaf, at + i), mean, is_square);
     }
-    return sum_of_block<MOMENTS_THREADS>(sum);
+    return sum_of_block<MASKED_THREADS>(sum);
 }
 
-KERNEL BOUNDS(1024) moments(MomentsParams p) {
+// Blocks along x: parts of the lanes; along y: statistics.
+KERNEL BOUNDS(256) moments(MomentsParams p) {
     wait_for_previous();
-    int statistic = blockIdx.x, leaf = 0;
-    float* results = p.moments;  // of the leaf
-    for (; statistic >= p.leaves[leaf].n_features / p.leaves[leaf].group; leaf++) {
-        int n_statistics = p.leaves[leaf].n_features / p.leaves[leaf].group;
-        statistic -= n_statistics;
-        results += 2 * n_statistics;
-    }
+    int statistic = blockIdx.y, leaf = 0;
+    for (; statistic >= p.leaves[leaf].n_features / p.leaves[leaf].group; leaf++)
+        statistic -= p.leaves[leaf].n_features / p.leaves[leaf].group;
     IntakeLeafParams chosen = p.leaves[leaf];
-    float n_counted = 0.f;
-    for (int lane = threadIdx.x; lane < p.n_lanes; lane += MOMENTS_THREADS)
+    float n_counted = 0.f, group = (float)chosen.group;
+    int start = blockIdx.x * MOMENTS_LANES, end = min(start + MOMENTS_LANES, p.n_lanes);
+    for (int lane = start + threadIdx.x; lane < end; lane += MASKED_THREADS)
         n_counted += p.is_counted[lane] ? 1.f : 0.f;
-    n_counted = sum_of_block<MOMENTS_THREADS>(n_counted);  // exact below 2^24
-    float n = fmaxf(n_counted, 1.f) * (float)chosen.group;
+    n_counted = sum_of_block<MASKED_THREADS>(n_counted);
     int first = statistic * chosen.group;
+    float n = fmaxf(n_counted, 1.f) * group;
     float mean = __fdiv_rn(sum_of<false>(p, chosen, first, 0.f), n);
-    float variance = __fdiv_rn(sum_of<true>(p, chosen, first, mean), n);
+    float squares = sum_of<true>(p, chosen, first, mean);
     if (threadIdx.x)
         return;
-    results[statistic] = mean;
-    results[chosen.n_features / chosen.group + statistic] = variance;
-    if (!blockIdx.x)
-        *p.n_counted = (long long)n_counted;
+    float* part = p.parts + 3ll * ((long long)blockIdx.y * gridDim.x + blockIdx.x);
+    part[0] = n_counted;
+    part[1] = mean;
+    part[2] = __fdiv_rn(squares, group);
 }
 
 // Changes nothing if no lane was counted, if moments do not count, or if a number is not finite.
