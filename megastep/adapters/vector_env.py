@@ -299,10 +299,20 @@ def as_dtype(leaf: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
     return leaf.to(dtype) if leaf.is_floating_point() else leaf
 
 
-@mapping
-def to_numpy(leaf: torch.Tensor) -> np.ndarray:
-    """Returns a tree of tensors as arrays that share no memory with them."""
-    return leaf.detach().to("cpu", copy=True).numpy()
+def to_numpy(tree: Tree) -> Tree:
+    """Returns a tree of tensors as arrays that share no memory with them. From a GPU all come
+    together, into pinned memory, and are waited for once.
+    """
+
+    @mapping
+    def on_cpu(leaf: torch.Tensor) -> torch.Tensor:
+        target = torch.empty(leaf.shape, dtype=leaf.dtype, pin_memory=leaf.is_cuda)
+        return target.copy_(leaf.detach(), non_blocking=True)
+
+    copies = on_cpu(tree)
+    for device in {leaf.device for leaf in leaves(tree) if leaf.is_cuda}:
+        torch.cuda.current_stream(device).synchronize()
+    return mapping(torch.Tensor.numpy)(copies)
 
 
 @mapping
