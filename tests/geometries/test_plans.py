@@ -396,7 +396,6 @@ def test_processes_give_what_one_gives(tmp_path):
 STRANGERS = HOSTILE.parent / "plans"
 #: Of drawings, the size in metres and the width of the inner wall's gap. All have two rooms.
 SIZES = {
-    "08_nested_svg": (4, 2.5, 0.45),
     "15_style_transform": (4, 2.5, 0.45),
     "26_butt_narrow_door": (8, 5, 0.6),
 }
@@ -423,7 +422,7 @@ def test_dialects_of_svg_give_the_same_plan(path):
 
 
 PEN = "fill:none;stroke:#000;stroke-width"
-KINDS = "rect path line class use symbol slice units font percent switch media stroke paint turn"
+KINDS = "rect path line class use units font switch media stroke paint turn"
 
 
 def drawn_as(kind, i, x, y, width, height):
@@ -447,22 +446,12 @@ def drawn_as(kind, i, x, y, width, height):
     elif kind == "use":
         defs = f'<g id="u{i}"><rect width="{width}" height="{height}" fill="red"/></g>'
         text = f'<use xlink:href="#u{i}" x="{x}" y="{y}"/>'
-    elif kind == "symbol":
-        defs = f'<symbol id="s{i}" viewBox="2 2 1 1" preserveAspectRatio="none">'
-        defs += '<path d="M2 2h1v1h-1z"/></symbol>'
-        text = f'<use href="#s{i}" {box}/>'
-    elif kind == "slice":
-        text = f'<svg {box} viewBox="0 0 9 9" preserveAspectRatio="xMidYMax slice">'
-        text += '<circle r="200%"/></svg>'
     elif kind == "units":
         mm = 96 / 25.4
         text = f'<rect x="{x / mm}mm" y="{y * 0.75}pt" width="{width / 96}in" height="{height}px"/>'
     elif kind == "font":
         text = f'<g font-size="125%"><rect x="{x / 20}em" y="{y}" width="{width / 20}em" '
         text += f'height="{height / 16}rem"/></g>'
-    elif kind == "percent":
-        text = f'<svg {box}><line y1="50%" x2="100%" y2="50%" stroke="#0f0" '
-        text += 'stroke-width="999%"/></svg>'
     elif kind == "switch":
         text = f"<switch><path requiredExtensions='a:b' d='M0 0h9v9z'/>{rect}/>{rect} y='9'/>"
         text = text.replace(" y='9'", " transform='scale(2)'") + "</switch>"
@@ -530,6 +519,7 @@ def test_what_is_not_read_of_a_drawing_is_said():
         '<g id="wall" clip-path="url(#a)">': "6 times clip-path",
         '<style>g:hover{fill:none}</style><g id="wall">': "the style 'g:hover'",
         '<g id="wall"><use href="#none"/>': "1 times use of what is not in the file",
+        '<g id="wall"><svg><rect/></svg>': "1 times svg",
     }.items():
         _, (warning,) = imports.svg.read(text.replace('<g id="wall">', change).encode(), 0.001)
         assert warning.startswith("not read, ") and words in warning

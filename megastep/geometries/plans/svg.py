@@ -21,7 +21,7 @@ LABELS = ("{http://www.inkscape.org/namespaces/inkscape}label", "data-name")
 HREFS = ("href", "{http://www.w3.org/1999/xlink}href")
 #: Elements that draw nothing where they are, or nothing that is a wall.
 SKIPPED = (
-    *("defs", "symbol", "clipPath", "mask", "marker", "pattern", "style", "script", "text"),
+    *("defs", "clipPath", "mask", "marker", "pattern", "style", "script", "text"),
     *("foreignObject", "linearGradient", "radialGradient", "metadata", "namedview"),
 )
 #: What changes a shape and is not read. Elements have it from those around them, to be counted.
@@ -34,10 +34,7 @@ INHERITED = {
     **{"stroke-linejoin": "miter", "stroke-miterlimit": "4", "visibility": "visible"},
     "font-size": "16",  # pixels of an em
 }
-OWN = {
-    **{"display": "inline", "opacity": "1", "transform": "", "vector-effect": "none"},
-    "overflow": "hidden",
-}
+OWN = {"display": "inline", "opacity": "1", "transform": "", "vector-effect": "none"}
 #: Pixels of a unit, of which 96 are an inch.
 UNITS = {"px": 1, "in": 96, "cm": 96 / 2.54, "mm": 96 / 25.4, "pt": 4 / 3, "pc": 16, "rem": 16}
 LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(%|[a-z]*)", re.I)
@@ -74,8 +71,6 @@ class _Place(NamedTuple):
     style: dict[str, str]
     opacity: float
     kind: str  # of a marked group around it
-    size: tuple[float, float]  # of the viewport, which is 100 %
-    clip: BaseGeometry | None  # by nested viewports, in metres
     chain: tuple  # (name, words) of the elements around it
 
 
@@ -107,12 +102,12 @@ def tokens(element: Element) -> list[str]:
     return (element.get("class") or "").split()
 
 
-def transform(text: str | None, above: Matrix, size: tuple[float, float] = (0, 0)) -> Matrix:
+def transform(text: str | None, above: Matrix) -> Matrix:
     """Returns a transform within one. Raises ValueError if it is not finite."""
     if not text or text == "none":
         return above
     matrix = Matrix(text)
-    matrix.render(ppi=96, width=size[0], height=size[1])
+    matrix.render(ppi=96, width=0, height=0)
     matrix = matrix * above
     if not np.isfinite([matrix.a, matrix.b, matrix.c, matrix.d, matrix.e, matrix.f]).all():
         raise ValueError(f"transform {text[:40]!r} is not finite")
@@ -125,8 +120,8 @@ def apply(matrix: Matrix, points: np.ndarray) -> np.ndarray:
     return points @ linear + (matrix.e, matrix.f)
 
 
-def length(text: str, whole: float, em: float = 16) -> float:
-    """Returns a length in pixels, of which `whole` are 100 %. Raises ValueError."""
+def length(text: str, em: float = 16, whole: float = 1) -> float:
+    """Returns a length in pixels, or a fraction of `whole`. Raises ValueError."""
     match = LENGTH.fullmatch(text.strip())
     sizes = UNITS | {"": 1, "%": whole / 100, "em": em}
     if not match or match[2].lower() not in sizes:
@@ -156,10 +151,10 @@ def declarations(text: str) -> tuple[dict[str, str], dict[str, str]]:
 def is_painted(paint: str, opacity: str) -> bool:
     """True if a fill or stroke can be seen."""
     paint, fallback = re.sub(r"url\([^)]*\)", "", paint).strip().lower(), "url(" in paint
-    if paint in ("none", "transparent") or length(opacity, 1) <= 0:
+    if paint in ("none", "transparent") or length(opacity) <= 0:
         return False
     if "/" in paint:  # as in rgb(0 0 0 / 0%)
-        return length(paint.partition("/")[2].strip(" )"), 1) > 0
+        return length(paint.partition("/")[2].strip(" )")) > 0
     return fallback or Color(paint).alpha != 0
 
 
@@ -177,7 +172,7 @@ class _Reader:
             if safe.name_of(element) == "style":
                 self._add_rules(element.text or "")
         self.rules.sort(key=lambda rule: rule[0])
-        self._visit(root, _Place(Matrix(), INHERITED, 1.0, "", (0, 0), None, ()))
+        self._visit(root, _Place(Matrix(), INHERITED, 1.0, "", ()))
 
     def _add_rules(self, text) -> None:
         for selectors, body in RULE.findall(MEDIA.sub(r"\1", IGNORED.sub("", text))):
@@ -204,10 +199,13 @@ class _Reader:
                 found |= body[is_important]
         return found
 
-    def _visit(self, element, place, box=None) -> None:
-        """Collects what is in an element. `box` is the width and height that a `use` gives it."""
+    def _visit(self, element, place) -> None:
+        """Collects what is in an element."""
         name = safe.name_of(element)
-        if name in SKIPPED and (name != "symbol" or box is None):
+        if name in SKIPPED:
+            return
+        if name == "symbol" or name == "svg" and place.chain:
+            self.unread[name] += 1
             return
         self.work += VISIT + len(self.rules)
         if self.work > MAX_WORK or len(place.chain) > safe.MAX_DEPTH:
@@ -228,34 +226,17 @@ class _Reader:
         once = {key: own.get(key, value) for key, value in OWN.items()}
         if once["display"] == "none":
             return
-        opacity = place.opacity * length(once["opacity"], 1)
+        opacity = place.opacity * length(once["opacity"])
         marked = [key for key, mark in self.marks.items() if is_marked(element, mark)]
-        kind, size, clip = (*marked, place.kind)[0], place.size, place.clip
-        matrix = transform(once["transform"], place.matrix, size)
+        kind, matrix = (*marked, place.kind)[0], transform(once["transform"], place.matrix)
 
         def of(key, default: Any = 0) -> float:
-            axis = next((letter for letter in key if letter in "xywh"), "r")
-            whole = size["yh".count(axis)] if axis != "r" else np.hypot(size[0], size[1]) / 2**0.5
-            return length(str(own.get(key, default)), whole, em)
+            text = str(own.get(key, default))
+            if "%" in text:
+                raise ValueError(f"{key}={text[:20]!r} is a part of a viewport, which is not read")
+            return length(text, em)
 
-        if name in ("svg", "symbol"):
-            own |= box or {}
-            view = safe.numbers(own.get("viewBox", ""))
-            if place.chain or not view:
-                width, height = (of(key, "100%") for key in ("width", "height"))
-                view = view or [0.0, 0.0, width, height]
-            if len(view) != 4 or place.chain and min(width, height, *view[2:]) <= 0:
-                return
-            if place.chain:  # the root's own units are the drawing's
-                x, y = (of(key) if name == "svg" else 0.0 for key in "xy")
-                if once["overflow"] in ("hidden", "scroll", "clip"):
-                    corners = shapely.get_coordinates(shapely.box(x, y, x + width, y + height))
-                    visible = shapely.Polygon(apply(matrix, corners) * self.scale)
-                    clip = visible if clip is None else clip & visible
-                sizes: Any = (x, y, width, height, *view, own.get("preserveAspectRatio"))
-                matrix = transform(svgelements.Viewbox.viewbox_transform(*sizes), matrix)
-            size = view[2], view[3]
-        place = _Place(matrix, style, opacity, kind, size, clip, chain)
+        place = _Place(matrix, style, opacity, kind, chain)
         if name == "use":
             href = next((own[key] for key in HREFS if key in own), "")
             target = self.ids.get(href[1:]) if href[:1] == "#" else None
@@ -263,8 +244,7 @@ class _Reader:
                 self.unread["use of what is not in the file"] += bool(kind)
                 return
             moved = transform(f"translate({of('x')}, {of('y')})", matrix)
-            box = {key: own[key] for key in ("width", "height") if key in own}
-            self._visit(target, place._replace(matrix=moved), box)
+            self._visit(target, place._replace(matrix=moved))
         elif kind and style["visibility"] == "visible" and opacity > 0:
             self._paint(name, own, of, place, once["vector-effect"] == "non-scaling-stroke")
         children = [child for child in element if "requiredExtensions" not in child.attrib]
@@ -297,8 +277,7 @@ class _Reader:
                 self.meetings = outlines.check_meetings(drawn, self.meetings)
                 first = outlines.area_of(rings, style["fill-rule"] == "evenodd")
             shapes.append(first)
-        whole = float(np.hypot(*place.size)) / 2**0.5
-        width = length(style["stroke-width"], whole, float(style["font-size"]))
+        width = length(style["stroke-width"], float(style["font-size"]))
         if width > 0 and is_painted(style["stroke"], style["stroke-opacity"]):
             size = self.scale[0] * (1 if is_fixed else area**0.5)
             half = max(width, outlines.GRID / size) / 2
@@ -308,8 +287,6 @@ class _Reader:
                 line = apply(place.matrix, line) if is_fixed else line
                 stroke = _stroke(line, is_closed, half, style)
                 shapes.append(shapely.transform(stroke, to_metres))
-        if place.clip is not None:
-            shapes = [shape & place.clip for shape in shapes]
         self.shapes[place.kind] += [shape for shape in shapes if not shape.is_empty]
 
     def _outline(self, name, own, of) -> list[tuple[np.ndarray, bool]]:
@@ -362,7 +339,7 @@ def _stroke(line, is_closed, half, style) -> BaseGeometry:
     if is_closed and not closes:  # there and back, with a join at either end
         cap = "round" if join == "round" else "flat"
     path = (shapely.LinearRing if closes else shapely.LineString)(line if len(line) > 1 else [])
-    limit = max(1.0, length(style["stroke-miterlimit"], 1))
+    limit = max(1.0, length(style["stroke-miterlimit"]))
     corners = np.array(path.coords) @ (1, 1j)
     steps = np.diff(np.append(corners, corners[1:2]) if closes else corners)
     cosines = (steps[1:] * steps[:-1].conj() / np.abs(steps[1:] * steps[:-1])).real
