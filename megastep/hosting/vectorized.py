@@ -27,8 +27,6 @@ __all__ = ["VectorizedEnv", "one_sentence"]
 MAX_NUMBERS = 16
 #: Steps of an episode in an evaluation, of environments whose specification names no limit.
 MAX_EPISODE_STEPS = 10_000
-#: A float frame with a larger number counts from 0 to 255; rounding may exceed 1 a little.
-MAX_FRACTION = 1.5
 DTYPES: Any = {torch.uint8: np.uint8, torch.float32: np.float32}
 
 
@@ -135,6 +133,8 @@ class VectorizedEnv:
         """Returns the frame of environment ``e``, (H, W, 3) uint8, as the environment renders it.
         Raises ValueError if it renders no images.
         """
+        from megastep.video import as_image  # with Pillow, which stepping does without
+
         self._call(self.vector.start_rendering)
         if self.vector.render_mode != "rgb_array":
             raise ValueError(
@@ -142,7 +142,7 @@ class VectorizedEnv:
                 "chooses another"
             )
         try:
-            return arrdict(frame=torch.from_numpy(as_frame(self._call(self.vector.render)[e])))
+            return arrdict(frame=torch.from_numpy(as_image(self._call(self.vector.render)[e])))
         except ValueError as error:
             raise ValueError(f"{self.id}: {error}") from None
 
@@ -225,25 +225,3 @@ def _plain(value) -> object:
     if isinstance(value, Collection):
         return [getattr(part, "item", lambda part=part: part)() for part in value]
     return value.item() if isinstance(value, np.generic) else value
-
-
-def as_frame(rendered: object) -> np.ndarray:
-    """Returns a rendered frame as (H, W, 3) uint8. It may be (H, W), (H, W, 1), (H, W, 3) or (H, W,
-    4), of uint8, other integers or floats from 0 to 255, or floats from 0 to 1.
-    """
-    frame = np.asarray(rendered)
-    frame = frame[..., None] if frame.ndim == 2 else frame
-    is_number = np.issubdtype(frame.dtype, np.number) or frame.dtype == bool
-    if frame.ndim != 3 or frame.shape[-1] not in (1, 3, 4) or not is_number or not frame.size:
-        kind = "None" if rendered is None else f"{frame.dtype} of shape {frame.shape}"
-        raise ValueError(f"render() returned {kind}, not an image of shape (H, W, 3)")
-    if frame.dtype != np.uint8:
-        is_fraction = not np.issubdtype(frame.dtype, np.integer) and frame.max() <= MAX_FRACTION
-        frame = np.nan_to_num(frame.astype(np.float64)) * (255 if is_fraction else 1)
-        if frame.min() < -0.5 or frame.max() > (MAX_FRACTION * 255 if is_fraction else 255.5):
-            raise ValueError(
-                f"render() returned numbers from {frame.min():g} to {frame.max():g}; an image has "
-                "uint8, or floats from 0 to 1 or 0 to 255"
-            )
-        frame = np.clip(np.rint(frame), 0, 255).astype(np.uint8)
-    return np.array(np.broadcast_to(frame[..., :3], (*frame.shape[:2], 3)))

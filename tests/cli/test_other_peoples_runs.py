@@ -89,11 +89,10 @@ def test_failure_in_an_evaluation(here, capsys):
     assert (here / "run/env_error.txt").exists()
 
 
-@pytest.mark.parametrize("name, grey", [("BuildsRenderer", 9), ("Float255", 128)])
-def test_odd_renderers_are_filmed(here, name, grey):
+def test_odd_renderers_are_filmed(here):
     from matplotlib.image import imread
 
-    words = ["env=gymnasium", env_id(name), "steps=2", "file=a.png", "device=cpu"]
+    words = ["env=gymnasium", env_id("BuildsRenderer"), "steps=2", "file=a.png", "device=cpu"]
     assert record.main(words) == 0
     image = (255 * imread(here / "a.png")[..., :3]).round()
-    assert (image == grey).all(-1).sum() >= 64  # below a caption, at least the 8 x 8 pixels
+    assert (image == 9).all(-1).sum() >= 64  # below a caption, at least the 8 x 8 pixels

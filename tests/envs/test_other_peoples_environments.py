@@ -2,8 +2,6 @@
 their spaces or Gymnasium's interface do not allow.
 """
 
-import re
-
 import numpy as np
 import pytest
 import torch
@@ -19,7 +17,6 @@ from megastep.hosting.env_error import BadValue, EnvError  # noqa: E402
 from megastep.hosting.hosted import HostedEnvs  # noqa: E402
 from megastep.hosting.probe import probe  # noqa: E402
 from megastep.hosting.values import beyond_bounds  # noqa: E402
-from megastep.hosting.vectorized import as_frame  # noqa: E402
 from tests.helpers import odd_envs  # noqa: E402
 
 
@@ -86,44 +83,13 @@ def test_the_try_leaves_global_generators_alone():
 # ---- Frames ----
 
 
-@pytest.mark.parametrize(
-    "rendered, expected",
-    [
-        (np.full((2, 3, 3), 7, np.uint8), 7),
-        (np.full((2, 3), 7, np.uint8), 7),
-        (np.full((2, 3, 4), 7, np.uint8), 7),
-        (np.full((2, 3, 3), 128.0), 128),
-        (np.full((2, 3, 3), 0.5), 128),
-        (np.full((2, 3, 3), 255.0), 255),
-    ],
-)
-def test_frames(rendered, expected):
-    frame = as_frame(rendered)
-    assert frame.shape == (2, 3, 3) and frame.dtype == np.uint8
-    assert (frame == expected).all()
-
-
-@pytest.mark.parametrize(
-    "rendered, text",
-    [
-        (None, "render() returned None, not an image"),
-        ("a frame", "render() returned <U7 of shape ()"),
-        (np.zeros((2, 3, 2)), "float64 of shape (2, 3, 2)"),
-        (np.full((2, 3, 3), 300.0), "numbers from 300 to 300"),
-    ],
-)
-def test_frames_that_are_no_images_are_named(rendered, text):
-    with pytest.raises(ValueError, match=re.escape(text)):
-        as_frame(rendered)
-
-
 def test_renderer_is_made_when_filming_alone():
     env = make("BuildsRenderer", 1, films=True)
     env.reset()
     assert (env.state(0).frame == 9).all()
     env = make("BuildsRenderer", 1)
     env.reset()
-    with pytest.raises(ValueError, match="render\\(\\) returned None"):
+    with pytest.raises(ValueError, match="a frame must have shape .H, W, 3., but this one has"):
         env.state(0)
 
 

@@ -93,10 +93,5 @@ class BuildsRenderer(Odd):
         return self.frame
 
 
-class Float255(Odd):
-    def render(self):
-        return np.full((8, 8, 3), 128.0)
-
-
 for _kind in [kind for kind in vars().values() if isinstance(kind, type) and issubclass(kind, Odd)]:
     gymnasium.register(f"Odd{_kind.__name__}-v0", _kind)
