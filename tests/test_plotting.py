@@ -200,15 +200,6 @@ def test_what_is_seen_later_is_drawn_over_what_is_kept(theme):
     assert pixel(image, plan, (1.5, 1))[0] > 0.7
 
 
-def test_methods_of_axes_draw_over_an_area():
-    figure, plan, _ = plotting.panels()
-    plotting.plot_scenery(SQUARE, LIT, ax=plan)
-    plan.plot([2, 4], [2, 2], color="b", linewidth=3)
-    assert pixel(plotting.rasterise(figure), plan, (3, 2))[2] > 0.9
-    with pytest.raises(AttributeError, match="no attribute 'plt'"):
-        plan.plt()
-
-
 def test_view_reaches_each_hit_leftmost_ray_first():
     # Two rays, 90 degrees, facing +y: in the camera frame they point along (1, 1/2) and (1, -1/2),
     # and left of +y is -x.

@@ -49,8 +49,7 @@ class Area(Artist):
     """A rectangle of a figure, and what is drawn in it.
 
     Points are data coordinates after :meth:`fit`, otherwise inches from the lower left corner.
-    Things with a higher ``z`` cover those with a lower one. Methods of matplotlib's ``Axes`` work
-    too, such as ``area.plot(x, y)``: they draw on axes that are put over the area, slowly.
+    Things with a higher ``z`` cover those with a lower one.
     """
 
     strip_label: Area  # beside a strip
@@ -74,46 +73,26 @@ class Area(Artist):
         area = cls.__new__(cls)
         Artist.__init__(area)
         area._place(ax.figure, ax.bbox)
-        area._overlay, area.transform = ax, ax.transData
+        area.transform = ax.transData
         ax.add_artist(area)
         return area
 
     def _place(self, figure, bbox) -> None:
-        self.bbox, self._overlay, self._things, self.style = bbox, None, [], current()
-        self._limits: dict = {}  # of an overlay
+        self.bbox, self._things, self.style = bbox, [], current()
         self.set_figure(figure)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or not hasattr(Axes, name):
-            raise AttributeError(f"an Area has no attribute {name!r}")
-        return getattr(self.overlay(), name)
-
-    def overlay(self) -> Axes:
-        """Returns matplotlib's axes over this area, without a frame."""
-        if self._overlay is None:
-            figure: Any = self.get_figure()
-            place = self.bbox.transformed(figure.transFigure.inverted())
-            self._overlay = figure.add_axes(place, frameon=False, xticks=[], yticks=[])
-            self._overlay.set(**self._limits)
-        return self._overlay
 
     def fit(self, low: np.ndarray, high: np.ndarray, foot: float = 0.0) -> None:
         """Makes points data coordinates: those from ``low`` to ``high``, (2,) each, are shown,
         above a ``foot`` in inches.
         """
-        if self._overlay is not None and self.transform is self._overlay.transData:
-            self._overlay.set_aspect("equal", adjustable="datalim")
-            self._overlay.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        if self.axes is not None:
+            self.axes.set_aspect("equal", adjustable="datalim")
+            self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             return
         size = np.array([self.width, self.height - foot])
         scale = float((size / (high - low)).min())  # inches per unit
-        centre, half = (low + high) / 2, size / scale / 2
-        low, high = centre - half - [0, foot / scale], centre + half
+        low = (low + high - size / scale) / 2 - [0, foot / scale]
         self.transform = Affine2D().translate(*-low).scale(scale) + self._inches
-        (x, y), (right, top) = low, high
-        self._limits = dict(xlim=(x, right), ylim=(y, top), autoscale_on=False)
-        if self._overlay is not None:
-            self._overlay.set(**self._limits)
 
     # ---- Things to draw ----
 
