@@ -5,11 +5,8 @@ without it, so such an environment is refused with the name of the operation.
 """
 
 import bisect
-import contextlib
 import ctypes
-import gc
 import struct
-import warnings
 from collections.abc import Callable
 
 import torch
@@ -17,6 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from megastep import spaces
 from megastep.arrdict import arrdict
+from megastep.engine.state_tree import walk
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import observed
 from megastep.spaces import random_actions
@@ -94,7 +92,8 @@ class Recorder:
         self.storages: dict[int, torch.UntypedStorage] = {}
         self.index: dict[int, int] = {}  # of the buffer of each storage
         self.buffers: list[Buffer] = []
-        self.scan()
+        for _, _, tensor in walk(env, torch.Tensor, only_state=False).values():
+            self.add(tensor)
 
     def refusal(self, reason: str) -> ValueError:
         return ValueError(f"{self.name} cannot be exported: {reason}")
@@ -103,7 +102,8 @@ class Recorder:
 
     def add(self, tensor: torch.Tensor) -> int:
         """Adds a tensor's storage. Returns its address."""
-        storage = torch.Tensor.untyped_storage(tensor)
+        with torch._C.DisableTorchFunctionSubclass():  # a ReadOnlyTensor would copy it
+            storage = tensor.untyped_storage()
         start = storage.data_ptr()
         if start not in self.storages:
             bisect.insort(self.starts, start)
@@ -112,23 +112,10 @@ class Recorder:
 
     def find(self, address: int) -> int:
         """Returns the address of the storage that an address lies in."""
-        for scan in (None, self.scan):
-            if scan:
-                scan()
-            i = bisect.bisect_right(self.starts, address) - 1
-            if i >= 0 and address < self.starts[i] + self.storages[self.starts[i]].nbytes():
-                return self.starts[i]
-        raise ValueError("a kernel reads memory that no tensor of PyTorch holds")
-
-    def scan(self) -> None:
-        """Adds all tensors of the process."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of tensors that an exporter has left, without memory
-            for one in gc.get_objects():
-                if issubclass(type(one), torch.Tensor):
-                    with contextlib.suppress(RuntimeError, NotImplementedError):  # without memory
-                        if one.device.type == "cpu":
-                            self.add(one)
+        i = bisect.bisect_right(self.starts, address) - 1
+        if i >= 0 and address < self.starts[i] + self.storages[self.starts[i]].nbytes():
+            return self.starts[i]
+        raise ValueError("a kernel reads memory that no tensor of the environment holds")
 
     def contents(self, start: int) -> bytes:
         return ctypes.string_at(start, self.storages[start].nbytes())
