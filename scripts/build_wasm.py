@@ -18,7 +18,6 @@ from megastep.envs.minatar import LIBRARY as MINATAR
 from megastep.envs.pointgoal import LIBRARY as POINTGOAL
 from megastep.envs.pong.tracker import LIBRARY as PONG
 from megastep.kernels.build import compile
-from megastep.kernels.build.kernel_library import WASM_FLAGS
 from megastep.kernels.build.launch import ENGINE
 from megastep.web.page import SHIPPED
 
@@ -37,11 +36,6 @@ def operations():
     }
 
 
-def build(flags=WASM_FLAGS):
-    """Returns the module."""
-    return compile.wasm(operations(), flags)
-
-
 if __name__ == "__main__":
-    SHIPPED.write_bytes(build())
+    SHIPPED.write_bytes(compile.wasm(operations()))
     print(f"{SHIPPED}: {SHIPPED.stat().st_size:,} bytes")

@@ -21,8 +21,7 @@ from megastep import geometries, spaces
 from megastep.agents import pretrained
 from megastep.agents.export.launches import add_policy
 from megastep.arrdict import arrdict
-from megastep.kernels.build.compile import EngineError, wasm_key, wasm_keys, wasm_tools
-from megastep.kernels.build.kernel_library import SCALAR_WASM_FLAGS
+from megastep.kernels.build.compile import EngineError, wasm, wasm_key, wasm_keys, wasm_tools
 from megastep.spaces import random_actions
 from megastep.types import n_lanes
 from megastep.web.page import FOLDER, SHIPPED, page, scene
@@ -55,15 +54,14 @@ def need(program):
 
 @pytest.fixture(scope="module")
 def modules(tmp_path_factory):
-    """Modules built now, with vectors and without."""
+    """A module built now."""
     try:
         wasm_tools()
     except EngineError as error:
         pytest.skip(str(error))
-    folder = tmp_path_factory.mktemp("modules")
-    (folder / "vectors.wasm").write_bytes(build_wasm.build())
-    (folder / "scalar.wasm").write_bytes(build_wasm.build(SCALAR_WASM_FLAGS))
-    return [str(folder / "vectors.wasm"), str(folder / "scalar.wasm")]
+    path = tmp_path_factory.mktemp("modules") / "kernels.wasm"
+    path.write_bytes(wasm(build_wasm.operations()))
+    return [str(path)]
 
 
 def run_page(folder, text, **steps):
@@ -93,7 +91,7 @@ def test_shipped_module_is_of_these_kernels():
 
 @pytest.mark.parametrize("name", tiers("deathmatch", *ENVS))
 def test_modules_compute_the_same_bits_for_1000_steps(name, modules, tmp_path):
-    """Every output and every state, after each step, in a shipped module and two built now."""
+    """Every output and every state, after each step, in the shipped module and one built now."""
     program, env = record(made(name)), made(name)
     replay, generator = Replay(program), torch.Generator().manual_seed(2)
     hashed = [i for i, buffer in enumerate(program.buffers) if buffer.n_bytes < 20_000]
@@ -119,7 +117,7 @@ def test_modules_compute_the_same_bits_for_1000_steps(name, modules, tmp_path):
             t for t, pair in enumerate(zip(result["hashes"], expected)) if len({*pair}) > 1
         ]
         assert not different, f"in step {different[0]}"
-    assert len(results) == 3 and n_ended > 0
+    assert len(results) == 2 and n_ended > 0
 
 
 def digest(replay, hashed):

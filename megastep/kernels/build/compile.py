@@ -139,17 +139,15 @@ def wasm_key(library: KernelLibrary) -> str:
     return _key(*files, *files.values(), *WASM_FLAGS)
 
 
-def wasm(
-    libraries: Mapping[KernelLibrary, Sequence[str]], flags: tuple[str, ...] = WASM_FLAGS
-) -> bytes:
+def wasm(libraries: Mapping[KernelLibrary, Sequence[str]]) -> bytes:
     """Returns CPU operations of several libraries as one WebAssembly module, which imports nothing,
     and exports them, `malloc` and its memory. It computes the same bits as the CPU. EngineError if
     clang or its libraries for WebAssembly are missing, or cannot build them.
     """
     command, version = wasm_tools()
     keys = {name: wasm_key(library) for library, names in libraries.items() for name in names}
-    key = _key(json.dumps(keys), *flags, command, version)
-    return cache.fetch(f"wasm-{key}.wasm", lambda: _build_wasm(libraries, command, flags, keys))[0]
+    key = _key(json.dumps(keys), command, version)
+    return cache.fetch(f"wasm-{key}.wasm", lambda: _build_wasm(libraries, command, keys))[0]
 
 
 def wasm_keys(module: bytes) -> dict[str, str]:
@@ -171,7 +169,7 @@ def wasm_tools() -> tuple[str, str]:
     )
 
 
-def _build_wasm(libraries, command, flags, keys) -> bytes:
+def _build_wasm(libraries, command, keys) -> bytes:
     linked = [f"-Wl,--export={name}" for name in ("malloc", *keys)]
     needs = f"kernels for a browser; it needs lld and WebAssembly's libraries{WASM_PACKAGES}"
     with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
@@ -180,7 +178,7 @@ def _build_wasm(libraries, command, flags, keys) -> bytes:
             folders = f"-I{library.folder}", f"-I{KERNELS}"
             for source in _cpu_sources(library, folder):
                 objects.append(str(Path(folder) / f"{i}-{Path(source).name}.o"))
-                _run([command, *flags, *folders, "-c", source, "-o", objects[-1]], needs)
+                _run([command, *WASM_FLAGS, *folders, "-c", source, "-o", objects[-1]], needs)
         out = Path(folder) / "kernels.wasm"
         # without -O: clang would have a wasm-opt that it finds change what it built
         options = "--target=wasm32-wasi", "-mexec-model=reactor", "-Wl,--strip-all"

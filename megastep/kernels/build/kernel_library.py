@@ -25,13 +25,12 @@ CPU_FLAGS = (
     *("-std=c++17", "-O3", "-march=native", "-ffp-contract=off", "-fno-tree-slp-vectorize"),
     *("-fno-math-errno", "-fno-trapping-math", "-fopenmp", "-shared", "-fPIC"),
 )
-#: clang's flags for WebAssembly without vectors. As the CPU's, with one thread, and small.
-SCALAR_WASM_FLAGS = (
+#: clang's flags for WebAssembly: as the CPU's, with one thread, small, vectors of 128 bits; never
+#: relaxed ones, whose results depend on the processor.
+WASM_FLAGS = (
     *("--target=wasm32-wasi", "-std=c++17", "-Os", "-ffp-contract=off", "-fno-math-errno"),
-    *("-fno-trapping-math", "-fopenmp-simd", "-fno-exceptions", "-fno-rtti", "-w"),
+    *("-fno-trapping-math", "-fopenmp-simd", "-fno-exceptions", "-fno-rtti", "-w", "-msimd128"),
 )
-#: The same with vectors of 128 bits. Never relaxed ones, whose results depend on the processor.
-WASM_FLAGS = (*SCALAR_WASM_FLAGS, "-msimd128")
 #: NVRTC's flags, without the architecture. No fused multiply-adds and IEEE division, so that the
 #: GPU computes the same bits as the CPU.
 CUDA_FLAGS = (
