@@ -15,13 +15,14 @@ from megastep.envs.explorer import LIBRARY as EXPLORER
 from megastep.envs.keys import LIBRARY as KEYS
 from megastep.envs.memory import LIBRARY as MEMORY
 from megastep.envs.minatar import LIBRARY as MINATAR
+from megastep.envs.minigrid.tasks import LIBRARY as MINIGRID
 from megastep.envs.pointgoal import LIBRARY as POINTGOAL
 from megastep.envs.pong.tracker import LIBRARY as PONG
 from megastep.kernels.build import compile
 from megastep.kernels.build.launch import ENGINE
 from megastep.web.page import SHIPPED
 
-LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MINATAR, MEMORY, KEYS, POLICY
+LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MINATAR, MINIGRID, MEMORY, KEYS, POLICY
 #: Operations of setting up, of scripted bots and of robots, which no page launches.
 ABSENT = {
     *("bake", "place_objects", "uniform", "bot", "scan"),

@@ -14,7 +14,7 @@ from megastep.agents.errors import UserError
 from megastep.agents.networks.convolutions import Cnn, Conv
 from megastep.agents.networks.cores import Stack
 from megastep.agents.networks.heads import MultiDiscreteOutput
-from megastep.agents.networks.intakes import ENCODERS, Flat, OneHot
+from megastep.agents.networks.intakes import ENCODERS, Categories, Flat, OneHot
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
 from megastep.agents.networks.plain_cores import Feedforward
@@ -67,6 +67,16 @@ def add_policy(
     return Acting(section, lanes, logits, lowering.states)
 
 
+def channels_of(leaf: Leaf) -> list[Leaf]:
+    """Returns each channel of images (B, A, C, H, W), (B, A, H, W)."""
+    (*lead, n, height, width), (*steps, stride, down, along) = leaf.shape, leaf.strides
+    shape, strides = (*lead, height, width), (*steps, down, along)
+    return [
+        Leaf(leaf.ref._replace(offset=leaf.ref.offset + i * stride * leaf.dtype.itemsize), shape, strides, leaf.dtype)
+        for i in range(n)
+    ]
+
+
 class _Lowering:
     def __init__(self, program, policy, lanes, seed) -> None:
         self.program, self.policy, self.lanes = program, policy.actor(), lanes
@@ -107,7 +117,13 @@ class _Lowering:
             leaf = self.program.world[f"obs.{path}".rstrip(".")]
             target = Ref(columns.buffer, FLOAT * first)
             if type(encoder) in (Flat, OneHot):
-                self.normalise(leaf, norm, encoder, target, n)
+                choices = len(encoder.values) if isinstance(encoder, OneHot) else 0
+                self.normalise(leaf, norm, choices, target, n)
+            elif isinstance(encoder, Categories):
+                for channel, size in zip(channels_of(leaf), encoder.SIZES):
+                    self.normalise(channel, norm, size, target, n)
+                    n_numbers = math.prod(channel.shape[1:]) * size
+                    target = target._replace(offset=target.offset + FLOAT * n_numbers)
             elif type(encoder) in (Conv, Cnn):
                 self.convolve(leaf, norm, encoder, target, n)
             else:
@@ -118,7 +134,7 @@ class _Lowering:
             first += cast(Flat, encoder).n_features
         return columns, n
 
-    def normalise(self, leaf: Leaf, norm, encoder, out: Ref, out_stride: int) -> None:
+    def normalise(self, leaf: Leaf, norm, choices: int, out: Ref, out_stride: int) -> None:
         if leaf.dtype not in KINDS:
             raise UserError(f"a page has no observations of {leaf.dtype}")
         shape = leaf.shape[1:]
@@ -133,7 +149,7 @@ class _Lowering:
             **{f"size{i}": size for i, size in enumerate(sizes)},
             **{f"stride{i}": stride for i, stride in enumerate(strides)},
             **dict(kind=KINDS[leaf.dtype], obs_stride=leaf.strides[0], out_stride=out_stride),
-            choices=len(encoder.values) if isinstance(encoder, OneHot) else 0,
+            choices=choices,
         )
 
     def convolve(self, leaf: Leaf, norm, encoder, out: Ref, out_stride: int) -> None:
@@ -146,7 +162,7 @@ class _Lowering:
             layers = [layer for layer in encoder.layers if isinstance(layer, nn.Conv2d)]
         n = n_agents * math.prod(shape)
         x = self.scratch(n)
-        self.normalise(leaf, norm, encoder, x, n)
+        self.normalise(leaf, norm, 0, x, n)
         for layer in layers:
             own = layer.kernel_size, layer.stride, cast("tuple[int, ...]", layer.padding)
             rows = 1, 1, 0  # of a convolution of rows

@@ -78,13 +78,13 @@ class OneHot(Encoder):
 
 class Categories(Encoder):
     """One-hot encoding of MiniGrid's images, whose channels are kind, colour and state of a cell:
-    (..., A, 3, H, W) -> (..., A 21 H W). ValueError for images of another number of channels.
+    (..., A, 3, H, W) -> (..., 21 A H W), the kinds of all cells first. ValueError for images of
+    another number of channels.
     """
 
     SIZES = 11, 6, 4  # as minigrid.core.constants has them; a state may be a direction
     is_normalised = False
-    channels: torch.Tensor  # (21,)
-    values: torch.Tensor  # (21, 1, 1), of the images' dtype, as converting them would take longer
+    values: torch.Tensor  # (11,), of the images' dtype, as converting them would take longer
 
     def __init__(self, space: spaces.MultiImage):
         super().__init__()
@@ -94,13 +94,13 @@ class Categories(Encoder):
                 f"not {space.C}"
             )
         self.n_features = math.prod(space.shape) // space.C * sum(self.SIZES)
-        channels = torch.arange(space.C).repeat_interleave(torch.tensor(self.SIZES))
-        values = torch.cat([torch.arange(size, dtype=torch.uint8) for size in self.SIZES])
-        self.register_buffer("channels", channels, persistent=False)
-        self.register_buffer("values", values[:, None, None], persistent=False)
+        values = torch.arange(max(self.SIZES), dtype=torch.uint8)
+        self.register_buffer("values", values, persistent=False)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return obs.index_select(-3, self.channels).eq(self.values).flatten(-4)
+        pairs = zip(obs[..., None].unbind(-4), self.SIZES)
+        parts = [channel.eq(self.values[:size]).flatten(-4) for channel, size in pairs]
+        return torch.cat(parts, -1)
 
 
 #: Encoders of images by name. An encoder is a module `Encoder(space)` with `n_features` that maps

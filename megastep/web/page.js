@@ -205,6 +205,43 @@ function drawMinAtar(game, context, width, height) {
   });
 }
 
+// Draws what a cell of MiniGrid holds around 0, as megastep/envs/minigrid/drawing.py does.
+const GRID = ["#e5484d", "#30a46c", "#3e63dd", "#8e4ec6", "#f5d90a", "#8b8d98"];
+function drawCell(context, cell) {
+  const kind = cell & 15, hue = GRID[cell >> 4], square = x => [[-x, -x], [x, -x], [x, x], [-x, x], [-x, -x]];
+  if ([2, 8, 9].includes(kind)) shape(context, square(0.5), kind === 9 ? "#ff8000" : hue);
+  if ([4, 10, 11].includes(kind)) shape(context, square(0.45), null, hue, 0.06);
+  if (kind > 9) shape(context, square(0.3), hue + (kind === 11 ? "cc" : "4d"));
+  if (kind === 6) disc(context, [0, 0], 0.31, hue);
+  if (kind === 7) [[...square(0.35)], [[-0.35, 0], [0.35, 0]]].forEach(line => shape(context, line, null, hue, 0.08));
+  if (kind !== 5) return;
+  disc(context, [0, -0.2], 0.16, hue);
+  [[[0, -0.2], [0, 0.35]], [[0, 0.3], [0.18, 0.3]]].forEach(line => shape(context, line, null, hue, 0.08));
+}
+
+// Draws a grid and its agent: megastep/envs/minigrid.
+function drawMiniGrid({ running: [simulation] }, context, width, height) {
+  const [columns, rows] = [simulation.word("width"), simulation.word("height")];
+  const [x, y, direction, carried] = simulation.field("games", 4, Int32Array);
+  const scale = Math.min(width / (columns + 1), height / (rows + 1));
+  const within = (left, top, size, draw) => {
+    context.save();
+    context.translate((width - columns * scale) / 2 + left * scale, (height - rows * scale) / 2 + top * scale);
+    context.scale(size * scale, size * scale);
+    draw();
+    context.restore();
+  };
+  context.fillStyle = css("--floor");
+  within(0, 0, 1, () => context.fillRect(0, 0, columns, rows));
+  simulation.field("cells", columns * rows, Uint8Array).forEach((cell, i) => (
+    within(i % columns + 0.5, Math.floor(i / columns) + 0.5, 1, () => drawCell(context, cell))));
+  within(x + 0.5, y + 0.5, 1, () => {
+    context.rotate(direction * Math.PI / 2);
+    shape(context, [[-0.3, -0.3], [0.38, 0], [-0.3, 0.3]], css("--text"));
+  });
+  within(x + 0.8, y + 0.2, 0.45, () => drawCell(context, carried));
+}
+
 // Draws rows of [red, green, blue] from 0 to 255 as pixels.
 function drawPixels(canvas, rows) {
   Object.assign(canvas, { width: rows[0].length, height: rows.length });
@@ -220,7 +257,7 @@ function drawPlayer({ simulation, lane, own, isHuman, element, name, score, numb
     if (width === undefined) texts.push(` · ${path.slice(4) || "sees"} ${values.map(x => x.toFixed(2)).join(" ")}`);
     else drawPixels(canvases.shift(), Array.from({ length: height }, (_, y) => Array.from({ length: width }, (_, x) => (
       [0, 1, 2].map(c => values[(Math.min(c, n - 1) * height + y) * width + x]).map(value => (
-        dtype === "uint8" ? (simulation.data.env === "MinAtar" ? 255 : 1) * value : n === 1 ? 255 * value : encode(value)))))));
+        dtype === "uint8" ? ({ MinAtar: 255, MiniGrid: 25 }[simulation.data.env] ?? 1) * value : n === 1 ? 255 * value : encode(value)))))));
   }
   const unit = x => [128 + 120 * Math.tanh(x), 128, 128 - 120 * Math.tanh(x)];
   const states = isHuman || !own ? [] : own.states.map(leaf => simulation.leaf(leaf, lane - own.lanes[0]).map(unit));
@@ -311,6 +348,7 @@ async function main() {
     context.scale(ratio, ratio);
     if (data.rooms) drawPlan(game, context, width, height, ratio);
     else if (data.env === "MinAtar") drawMinAtar(game, context, width, height);
+    else if (data.env === "MiniGrid") drawMiniGrid(game, context, width, height);
     else if (game.running[0].word("games")) drawPong(game, context, width, height);
     game.players.forEach(drawPlayer);
     Object.assign(context, { font: "600 14px system-ui, sans-serif", textAlign: "left" });

@@ -47,6 +47,9 @@ class Noise:
             if isinstance(space, spaces.MultiDiscrete):
                 shape = self.n_envs, *space.shape
                 return torch.randint(space.n_actions, shape, generator=self.generator)
+            if getattr(space, "dtype", None) == torch.uint8:  # categories
+                shape = self.n_envs, *space.shape
+                return torch.randint(12, shape, generator=self.generator, dtype=torch.uint8)
             return 3 * torch.randn(self.n_envs, *space.shape, generator=self.generator) + 1
 
         def allow(space):

@@ -12,11 +12,15 @@ from megastep.dotdict import leaves
 from megastep.web.program import Buffer, Leaf, Program, Ref, Replay
 from tests.export.test_export import IMAGE, MANY, VECTOR, Noise
 
+GRID = arrdict(
+    image=spaces.MultiImage(2, 3, 4, 5, dtype=torch.uint8), to=spaces.MultiDiscrete(2, 4)
+)
 MOVE = spaces.MultiDiscrete(2, 7)
 #: Every core and encoder of a page: spaces, and settings of the policy.
 KINDS = {
     "lstm": (MANY, MOVE, dict(encoder="conv")),
     "mingru": (MANY, MOVE, dict(core="mingru", layers=2, encoder="cnn")),
+    "grid": (GRID, MOVE, dict(core="mingru", encoder="categories")),
     "none": (VECTOR, MOVE, dict(core="none", activation="tanh", width=30)),
 }
 

@@ -21,6 +21,7 @@ ENVS = {
     "pong": (envs.Pong, dict(n_envs=1, self_play=True)),
     "pixels": (envs.Pong, dict(n_envs=2, pixels=True)),
     "minatar": (envs.MinAtar, dict(n_envs=1, id="seaquest", limit=30)),
+    "minigrid": (envs.MiniGrid, dict(n_envs=2, id="MiniGrid-KeyCorridorS3R1-v0")),
     "memory": (envs.Memory, dict(n_envs=1, limit=30, resample=True)),
     "keys": (envs.Keys, dict(n_envs=1, limit=30, resample=True)),
 }
@@ -29,6 +30,6 @@ ENVS = {
 def made(name, **changes):
     """Returns an environment by its name here, always with the same seed and homes."""
     kind, settings = ENVS[name]
-    if kind not in (envs.Pong, envs.MinAtar):
+    if kind not in (envs.Pong, envs.MinAtar, envs.MiniGrid):
         changes = dict(geometries=geometries.sample("homes", 3, seed=7), **changes)
     return kind(**{**settings, "device": "cpu", "seed": 3, **changes})

@@ -3,7 +3,7 @@
 //   EACH           defines an operation in a header, for both: a `statement` about parameters p and
 //                  each i below `count`; `threads` of the CPU may depend on n, the count
 //   HD             declares a function for both
-//   RARE           as HD, but calls of it are not inlined on a GPU
+//   RARE           as HD, but calls of it are not inlined on a GPU and in WebAssembly
 //   ALIGNED, LOAD  16-byte records, and reading one in one instruction
 //   OR_BITS, ADD   update a word that other threads may update too
 //   COUNT_BITS     number of bits set

@@ -2,7 +2,11 @@
 #pragma once
 
 #define HD static inline
+#ifdef __wasm__  // whose modules are to be small
+#define RARE static __attribute__((noinline))
+#else
 #define RARE static inline
+#endif
 #define KERNEL extern "C" void
 #define EACH(operation, Params, count, threads, statement)                                         \
     KERNEL operation(const Params& p) {                                                            \

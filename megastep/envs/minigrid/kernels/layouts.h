@@ -6,7 +6,7 @@
 // yellow, four bits each.
 HD int colour_by_name(int i) { return 0x403512 >> 4 * i & 15; }
 
-HD int draw_colour(Game& g, const Grid& grid) {
+RARE int draw_colour(Game& g, const Grid& grid) {
     return colour_by_name(draw(g, grid, 0, N_COLOURS));
 }
 
@@ -18,7 +18,7 @@ RARE void fill(const Grid& grid, Rectangle in, int cell) {
 
 HD void wall(const Grid& grid, Rectangle along) { fill(grid, along, cell_of(WALL, GREY)); }
 
-HD void wall_around(const Grid& grid, Rectangle r) {
+RARE void wall_around(const Grid& grid, Rectangle r) {
     wall(grid, {r.x, r.y, r.width, 1});
     wall(grid, {r.x, r.y + r.height - 1, r.width, 1});
     wall(grid, {r.x, r.y, 1, r.height});
@@ -136,7 +136,7 @@ HD Rooms make_rooms(Game& g, const Grid& grid, int size, int n_columns, int n_ro
     return r;
 }
 
-HD int add_door(Game& g, const Grid& grid, Rooms& r, int i, int j, int direction, int kind) {
+RARE int add_door(Game& g, const Grid& grid, Rooms& r, int i, int j, int direction, int kind) {
     int colour = draw_colour(g, grid);
     grid.cells[door_place(grid, r, i, j, direction)] = (unsigned char)cell_of(kind, colour);
     connect(r, i, j, direction);
@@ -147,12 +147,12 @@ HD int add_door(Game& g, const Grid& grid, Rooms& r, int i, int j, int direction
 
 HD int near_agent(const Game& g, int x, int y) { return absi(g.x - x) + absi(g.y - y) < 2; }
 
-HD void add_object(Game& g, const Grid& grid, const Rooms& r, int i, int j, int cell) {
+RARE void add_object(Game& g, const Grid& grid, const Rooms& r, int i, int j, int cell) {
     place_unless(g, grid, cell, room(r, i, j), MAX_TRIES,
                  [&](int x, int y) { return near_agent(g, x, y); });
 }
 
-HD int add_random(Game& g, const Grid& grid, const Rooms& r, int i, int j, int kind) {
+RARE int add_random(Game& g, const Grid& grid, const Rooms& r, int i, int j, int kind) {
     int cell = cell_of(kind, draw_colour(g, grid));
     add_object(g, grid, r, i, j, cell);
     return cell;
@@ -220,8 +220,8 @@ struct ChainedRoom {
 };
 
 // Draws a room behind a door in one of its walls. Returns 0 if it does not fit.
-HD int chain_room(Game& g, const Grid& grid, ChainedRoom* rooms, int n, int wall_of_door, int x,
-                  int y) {
+RARE int chain_room(Game& g, const Grid& grid, ChainedRoom* rooms, int n, int wall_of_door, int x,
+                    int y) {
     int w = draw(g, grid, 4, grid.c + 1), h = draw(g, grid, 4, grid.c + 1);
     int left = x, top = y;
     if (n > 0) {
@@ -301,7 +301,7 @@ RARE void lava_gap(Game& g, const Grid& grid) {
 }
 
 // Shuffles n items (Fisher and Yates), from the last.
-HD void shuffle(Game& g, const Grid& grid, int* items, int n) {
+RARE void shuffle(Game& g, const Grid& grid, int* items, int n) {
     for (int i = n - 1; i > 0; i--) {
         int other = draw(g, grid, 0, i + 1), item = items[i];
         items[i] = items[other];
