@@ -71,10 +71,8 @@ def channels_of(leaf: Leaf) -> list[Leaf]:
     """Returns each channel of images (B, A, C, H, W), (B, A, H, W)."""
     (*lead, n, height, width), (*steps, stride, down, along) = leaf.shape, leaf.strides
     shape, strides = (*lead, height, width), (*steps, down, along)
-    return [
-        Leaf(leaf.ref._replace(offset=leaf.ref.offset + i * stride * leaf.dtype.itemsize), shape, strides, leaf.dtype)
-        for i in range(n)
-    ]
+    offsets = (leaf.ref.offset + i * stride * leaf.dtype.itemsize for i in range(n))
+    return [Leaf(Ref(leaf.ref.buffer, offset), shape, strides, leaf.dtype) for offset in offsets]
 
 
 class _Lowering:
