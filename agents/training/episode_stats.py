@@ -117,8 +117,7 @@ class EpisodeStats:
             of_metrics = torch.stack([metrics[name].float() for name in self.metrics])
         if not isinstance(learns, torch.Tensor):
             learns = torch.full_like(done, learns)
-        count = self._count_in_kernel if reward.is_cuda else self._count
-        sums, has_begun = count(reward, reset, done, learns, of_metrics, layouts)
+        sums, has_begun = self._count(reward, reset, done, learns, of_metrics, layouts)
         began = torch.stack([self.began, self.newest.expand_as(self.began)])  # (2, B)
         is_in = (began == self.numbers[:, None]).double()  # (K, 2, B)
         columns = torch.cat([sums[0] * self.members[:, None, None], sums[1:]])  # (C, S, 2, B)
@@ -132,40 +131,6 @@ class EpisodeStats:
         """Returns the sums over the episodes that ended, (1 + sources, S, 2, B): of the episode
         that began before, and of those after it; and whether an episode began, (B,) bool.
         """
-        reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
-        steps = torch.stack([reward.double(), (~reset).double()])
-        totals = self.totals[:, None] + steps.cumsum(1)  # (2, T, B), over episodes
-        at_end = torch.cat([torch.zeros_like(totals[:, :1]), totals], 1)
-        rows = torch.arange(1, len(reward) + 1, device=reward.device)[:, None]
-        ends = torch.where(done, rows, 0).cummax(0).values  # the last end so far, from 1; 0: none
-        before = torch.cat([torch.zeros_like(ends[:1]), ends[:-1]])
-        returns, lengths = totals - at_end.gather(1, before.expand(2, -1, -1))
-        counts = done & learns & (self.is_whole | (before > 0))
-        values = torch.stack([torch.ones_like(returns), returns, returns**2, lengths])
-        if metrics is not None:
-            is_good = metrics.abs() <= LIMIT
-            good = torch.where(is_good, metrics, 0.0)
-            values = torch.cat([values, good, ~is_good, ~is_good & ~metrics.isnan()])
-        each = [counts]
-        if self.sources:
-            last = len(self.source_of_layout) - 1
-            source = self.source_of_layout[layouts.clamp(0, last).long()]
-            is_known = counts & (layouts >= 0) & (layouts <= last)
-            each += [is_known & (source == number) for number in range(len(self.sources))]
-        sums = [
-            torch.stack([torch.where(these & is_part, values, 0.0).sum(1) for is_part in parts], 1)
-            for these in each
-            for parts in [(before == 0, before > 0)]
-        ]
-        last_end = ends[-1:]
-        self.totals.copy_((totals[:, -1:] - at_end.gather(1, last_end.expand(2, -1, -1)))[:, 0])
-        self.is_whole |= last_end[0] > 0
-        return torch.stack(sums), (done | reset).any(0)
-
-    def _count_in_kernel(
-        self, reward, reset, done, learns, metrics, layouts
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Does the same in one kernel."""
         n_steps, n_lanes = reward.shape
         n_columns = 1 + len(self.sources)
         sums = self.sums.new_zeros(n_columns, self.sums.shape[1], 2, n_lanes)

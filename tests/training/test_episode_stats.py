@@ -1,5 +1,7 @@
 """Episode statistics, compared with a slow count."""
 
+import itertools
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -309,21 +311,41 @@ def test_a_graph_on_a_gpu_counts_as_the_cpu_does():
 
 
 @pytest.mark.parametrize("metrics, sources", [((), None), (("a", "b"), ("s", "t", "s"))])
-def test_kernel_counts_as_pytorch_does(metrics, sources):
+def test_sums_are_those_of_a_slow_count(metrics, sources):
     random = torch.Generator().manual_seed(1)
     shape = 40, 50
-    group = {"leader": torch.rand(50, generator=random) < 0.5}
-    one, two = (EpisodeStats(50, "cpu", metrics, group, True, sources) for _ in range(2))
-    two._count = two._count_in_kernel
-    for _ in range(6):
-        reward, *others = torch.randn((1 + len(metrics), *shape), generator=random)
+    leads, n = torch.rand(50, generator=random) < 0.5, len(metrics)
+    stats = EpisodeStats(50, "cpu", metrics, {"leader": leads}, True, sources)
+    expected, running = torch.zeros_like(stats.sums[:, :, 0]), [(0.0, 0, False)] * 50
+    for _ in range(3):
+        reward, *others = torch.randn((1 + n, *shape), generator=random)
         for tensor, value in zip([reward, *others], (float("nan"), float("inf"), float("nan"))):
             tensor[torch.rand(shape, generator=random) < 0.1] = value
         done, late = torch.rand((2, *shape), generator=random) < torch.tensor([[[0.05]], [[0.7]]])
         reset = torch.cat([done[:1] & False, done[:-1] & late[1:]])
         learns = torch.rand(shape, generator=random) < 0.8
         layouts = torch.randint(-1, 4, shape, generator=random, dtype=torch.int32)
-        for stats in one, two:
-            stats.add(reward, reset, done, learns, dict(zip(metrics, others)), layouts)
-        for name in "sums", "totals", "is_whole", "began":
-            assert torch.allclose(getattr(one, name).double(), getattr(two, name).double()), name
+        stats.add(reward, reset, done, learns, dict(zip(metrics, others)), layouts)
+        for t, lane in itertools.product(range(40), range(50)):
+            total, length, is_whole = running[lane]
+            total += float(reward[t, lane].nan_to_num(0.0))
+            length += not reset[t, lane]
+            if done[t, lane] and learns[t, lane] and is_whole:
+                of_metrics = [float(one[t, lane]) for one in others]
+                left_out = [not math.isfinite(x) for x in of_metrics]
+                good = [0.0 if bad else x for x, bad in zip(of_metrics, left_out)]
+                row = [1, total, total**2, length, *good, *left_out, *map(math.isinf, of_metrics)]
+                where = int(layouts[t, lane])
+                of_source = (
+                    [*stats.sources].index(sources[where]) if sources and 0 <= where < 3 else None
+                )
+                columns = [
+                    0,
+                    *[1] * bool(leads[lane]),
+                    *([] if of_source is None else [2 + of_source]),
+                ]
+                expected[columns] += torch.tensor(row, dtype=torch.float64)
+            running[lane] = (0.0, 0, True) if done[t, lane] else (total, length, is_whole)
+    assert expected[0, 0] > 100
+    assert torch.allclose(stats.sums.sum(2), expected)
+    assert torch.allclose(stats.totals, torch.tensor([r[:2] for r in running]).double().T)
