@@ -139,14 +139,9 @@ def check_memory(
     """Raises UserError with the number that fits, if environments, a replay buffer or members need
     more than the memory. The `sample` counts what environments share; if that is too much, more do.
     """
-
-    def fit(bytes_each) -> None:
-        if n_members == 1:
-            engine.fit(env.n_envs, bytes_each, sample.device)
-        else:
-            what = "members (population.size)"
-            engine.fit(n_members, env.n_envs * bytes_each, sample.device, what)
-
+    n_things, n_each, what = env.n_envs, 1, "environments"
+    if n_members > 1:
+        n_things, n_each, what = n_members, env.n_envs, "members (population.size)"
     options = with_defaults(learner, LearnerOptions)
     n_bytes = options.bytes_per_env(sample)
     n, each = options.replay_size(sample)
@@ -155,13 +150,13 @@ def check_memory(
         engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
         n_bytes += n * each / env.n_envs
         try:
-            fit(total + n_bytes)
+            engine.fit(n_things, n_each * (total + n_bytes), sample.device, what)
         except engine.EngineError:
             if env.n_envs > PROBE:  # fewer tell for themselves whether they fit
                 probe = changed(env, n_envs=PROBE)
                 probe = construct(probe, geometries=geometries[:1], **arguments)
                 n_bytes += (_nbytes(probe) - total) / (PROBE - sample.n_envs)
-                fit(n_bytes)
+                engine.fit(n_things, n_each * n_bytes, sample.device, what)
             elif n_members > 1:
                 raise
 
