@@ -104,7 +104,6 @@ ADDED = {
 
 
             COMMAND = Command("greet", run, "Says hello.")
-            main = COMMAND.main
             """,
         "agents/cli/entry.py": """
 

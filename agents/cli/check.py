@@ -33,4 +33,3 @@ def run(path: str) -> None:
 
 
 COMMAND = Command("check", run, HELP)
-main = COMMAND.main

@@ -38,4 +38,3 @@ def run(
 
 
 COMMAND = Command("compare", run, HELP)
-main = COMMAND.main

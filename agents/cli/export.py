@@ -45,4 +45,3 @@ def run(
 
 
 COMMAND = Command("export", run, HELP)
-main = COMMAND.main

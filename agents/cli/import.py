@@ -188,4 +188,3 @@ def _report(source, path, plans, n) -> str:
 
 
 COMMAND = Command("import", run, HELP)
-main = COMMAND.main

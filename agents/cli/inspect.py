@@ -81,4 +81,3 @@ def _parts(state: "StateDict | None") -> Iterator[str]:
 
 
 COMMAND = Command("inspect", run, HELP)
-main = COMMAND.main

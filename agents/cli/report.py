@@ -35,4 +35,3 @@ def page(file: str | None, default: Path) -> Path:
 
 
 COMMAND = Command("report", run, HELP)
-main = COMMAND.main

@@ -142,4 +142,3 @@ def compare(name: str, row: dict, folder: Path, found: list[Interval]) -> int:
 
 
 COMMAND = Command("reproduce", run, HELP)
-main = COMMAND.main

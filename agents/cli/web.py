@@ -44,4 +44,3 @@ def run(
 
 
 COMMAND = Command("web", run, HELP)
-main = COMMAND.main
