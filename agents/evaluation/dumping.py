@@ -48,7 +48,7 @@ def run(cfg: settings.Dump) -> Path:
     Raises:
         UserError: the folder has other files, or the disk is too small; nothing is half-written.
     """
-    start, folder, device = time.monotonic(), Path(cfg.folder), factory.make_device(cfg.device)
+    folder, device = Path(cfg.folder), factory.make_device(cfg.device)
     if cfg.format != "npz":
         with user_errors(kinds=(data.DatasetError,)):
             formats.require(cfg.format)
@@ -76,10 +76,11 @@ def run(cfg: settings.Dump) -> Path:
                     formats.convert(cfg.format, data.load(staged), folder, console.count)
             if cfg.format != "npz":
                 delete(staged)
-    console.say(
-        f"{cfg.episodes:,} episodes are in {folder}; {waves.n_steps:,} steps of them were written "
-        f"in {console.duration(time.monotonic() - start)}"
-    )
+    said = f"{cfg.episodes:,} episodes are in {folder}"
+    if waves.n_steps:
+        rate = console.number(waves.n_steps / waves.seconds)
+        said += f"; {waves.n_steps:,} steps were played and written at {rate}/s"
+    console.say(said)
     return folder
 
 
@@ -172,6 +173,7 @@ class Waves:
 
     Attributes:
         n_steps: steps written so far.
+        seconds: that took.
     """
 
     def __init__(
@@ -182,7 +184,7 @@ class Waves:
         loaded: checkpoint.Checkpoint | None,
         device: torch.device,
     ):
-        self.cfg, self.loaded, self.n_steps = cfg, loaded, 0
+        self.cfg, self.loaded, self.n_steps, self.seconds = cfg, loaded, 0, 0.0
         self.where: dict = dict(seed=cfg.seed, device=device)
         sample = factory.make_sample(env, homes, **self.where)
         n_agents = optional(sample, "n_agents")
@@ -302,6 +304,7 @@ class Waves:
 
     def write(self, folder: Path) -> None:
         """Writes the episodes that are missing in a folder."""
+        start = time.monotonic()
         for path in folder.glob("*.tmp"):
             delete(path)
         there, n = {path.name for path in folder.glob("episode-*.npz")}, self.cfg.episodes
@@ -325,6 +328,7 @@ class Waves:
                 console.count(first + len(lanes), n)
             for task in pending:
                 task.result()
+        self.seconds = time.monotonic() - start
 
     def _check_room(self, folder, played, n_missing) -> None:
         arrays, lengths, _ = played
