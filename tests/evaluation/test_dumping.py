@@ -14,6 +14,7 @@ from megastep import colour, data
 from megastep.agents.cli import dump
 from megastep.agents.evaluation import dumping
 from megastep.agents.generator import stream_seed
+from megastep.agents.storage import collector
 from megastep.data import episodes
 from tests.helpers import faults
 
@@ -161,6 +162,16 @@ def test_a_trained_agent_plays_its_own_environment(few, tmp_path):
     assert batch.valid.sum(0).tolist() == n and batch.obs.d.shape[:2] == (max(n) + 1, 4)
     assert torch.equal(batch.actions[: n[1], 1], stored[1].actions)
     assert not batch.reward[n[1] :, 1].any()
+
+
+@pytest.mark.cuda
+def test_graphs_have_the_bytes_of_single_steps(few, tmp_path, monkeypatch):
+    words = "env=memory", "geometry=memory_maze", "geometry.n=6", "max_steps=40", "truth=true"
+    words = ["run=memory_9", "episodes=10", "device=cuda", *words]
+    assert dump.main([*words, f"folder={tmp_path / 'graphs'}"]) == 0
+    monkeypatch.setattr(collector, "capture_with", lambda env, policies, function, **_: function)
+    assert dump.main([*words, f"folder={tmp_path / 'steps'}"]) == 0
+    assert contents(tmp_path / "graphs") == contents(tmp_path / "steps")
 
 
 def test_a_full_disk_is_one_sentence(few, tmp_path, capsys, monkeypatch):
