@@ -77,17 +77,15 @@ class Resets:
         if mask is None or world is None:
             return self.keep(begin(chosen))
         self.is_used = True
-        rows = [*self._rows(env)]
-        before = [leaf.clone() for leaf, _ in rows]
-        leaves = _pytree.tree_leaves(world)
-        world_before = [leaf.clone() for leaf in leaves]
+        rows, leaves = [*self._rows(env)], _pytree.tree_leaves(world)
+        before = _copies([*(leaf for leaf, _ in rows), *leaves])
         new = begin(chosen)
-        began = new["reset"].clone()
-        for (leaf, axis), old in zip(rows, before):
-            leaf.copy_(torch.where(_along(began, env.n_envs, leaf, axis), leaf, old))
+        began, fresh = new["reset"].clone(), _pytree.tree_leaves(new)
         # in place, so that a CUDA graph that steps and one that resets share the world
-        for leaf, fresh, old in zip(leaves, _pytree.tree_leaves(new), world_before, strict=True):
-            leaf.copy_(torch.where(_along(began, env.n_envs, leaf, 0), fresh, old))
+        parts = [(*row, row[0]) for row in rows]
+        parts += [(leaf, 0, own) for leaf, own in zip(leaves, fresh, strict=True)]
+        for (leaf, axis, own), old in zip(parts, before, strict=True):
+            torch.where(_along(began, env.n_envs, leaf, axis), own, old, out=leaf)
         return world
 
     def _rows(self, env) -> Iterable[tuple[torch.Tensor, int]]:
@@ -116,6 +114,15 @@ class Resets:
             places = _along(chosen, env.n_envs, counter, 0)
             starts = _along(start, env.n_envs, counter, 0)
             counter.copy_(torch.where(places, starts.to(counter.dtype), counter))
+
+
+def _copies(leaves) -> list[torch.Tensor]:
+    """Returns copies of tensors, on a GPU by a kernel for those of each dtype."""
+    pairs = [(torch.empty_like(leaf), leaf) for leaf in leaves]
+    for dtype in {leaf.dtype for leaf in leaves}:
+        copies, some = zip(*(pair for pair in pairs if pair[1].dtype == dtype))
+        torch._foreach_copy_(copies, some)  # pyright: ignore[reportPrivateImportUsage]
+    return [copy for copy, _ in pairs]
 
 
 def _first_draw(seed: Integers) -> Integers:
