@@ -3,7 +3,6 @@ the recurrence. B lanes, W units.
 """
 
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
@@ -12,41 +11,32 @@ from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels" / "acting", FAST_CUDA_FLAGS)
-_ROWS, _INNER, _STAGES = (LIBRARY.constants[f"STEP_{name}"] for name in ("ROWS", "INNER", "STAGES"))
+_LANES, _ROWS, _INNER, _STAGES, _THREADS = (
+    LIBRARY.constants[f"STEP_{name}"] for name in "LANES ROWS INNER STAGES THREADS".split()
+)
+MINGRU, LSTM = 2, 4  # the gates G of the cores that have a kernel
+OPERATIONS = {MINGRU: "mingru_step", LSTM: "lstm_step"}
 
 
-class Kind(NamedTuple):
-    """A core that has a kernel."""
-
-    operation: str
-    n_gates: int
-    n_lanes: int  # of a block
-
-
-MINGRU = Kind("mingru_step", 2, LIBRARY.constants["MINGRU_LANES"])
-LSTM = Kind("lstm_step", 4, LIBRARY.constants["LSTM_LANES"])
-
-
-def blocks(kind: Kind, n_lanes: int, width: int) -> Blocks:
+def blocks(n_gates: int, n_lanes: int, width: int) -> Blocks:
     """Returns the blocks that step all lanes."""
-    n_blocks = -(-n_lanes // kind.n_lanes) * width * kind.n_gates // _ROWS
-    n_bytes = _STAGES * (kind.n_lanes + _ROWS) * 2 * _INNER
-    return Blocks(n_blocks, 1, 2 * kind.n_lanes, n_bytes)
+    n_blocks = -(-n_lanes // _LANES) * width * n_gates // _ROWS
+    return Blocks(n_blocks, 1, _THREADS, _STAGES * (_LANES + _ROWS) * 2 * _INNER)
 
 
-@fused(lambda kind, x, dtype: True, lambda *args: _fits(*args))
-def fits(kind: Kind, x: torch.Tensor, dtype: torch.dtype) -> bool:
+@fused(lambda *_: True, lambda *args: _fits(*args))
+def fits(n_gates: int, x: torch.Tensor, dtype: torch.dtype) -> bool:
     """Returns whether `step` takes inputs x (T, B, W) on their device, to compute in `dtype`."""
     return False
 
 
-def _fits(kind, x, dtype) -> bool:
+def _fits(n_gates, x, dtype) -> bool:
     is_step = x.is_cuda and dtype == torch.bfloat16 and len(x) == 1 and not x.shape[-1] % _INNER
-    return is_step and has_hopper(x.device, blocks(kind, 0, x.shape[-1]).shared)
+    return is_step and has_hopper(x.device, blocks(n_gates, 0, x.shape[-1]).shared)
 
 
 def step(
-    kind: Kind,
+    n_gates: int,
     x: torch.Tensor,
     weight: torch.Tensor,
     bias: torch.Tensor,
@@ -60,7 +50,7 @@ def step(
 
     Args:
         x: (1, B, W) bfloat16; added to the outputs if `is_residual`.
-        weight: (G W, K) bfloat16 of G gates: of x and, of an LSTM, then of the last output.
+        weight: (G W, K) bfloat16: of x and, of an LSTM, then of the last output.
         bias: (G W,) bfloat16.
         reset: (1, B) bool; clears a lane's state before the step.
         state: (B, W) float32, the minGRU's, or the LSTM's cell.
@@ -72,7 +62,7 @@ def step(
         last_output = aligned(last_output.to(x.dtype))
         next_output = torch.empty_like(last_output)
     launch(
-        *(LIBRARY, kind.operation, x.device, blocks(kind, n_lanes, width)),
+        *(LIBRARY, OPERATIONS[n_gates], x.device, blocks(n_gates, n_lanes, width)),
         **dict(x=x, weight=aligned(weight), bias=aligned(bias), reset=reset.contiguous()),
         **dict(last_output=last_output, last_state=state),
         **dict(outputs=outputs, next_output=next_output, next_state=next_state),

@@ -17,18 +17,23 @@
 #include "constants.h"
 #include "params.h"
 
-// Leaves a thread 128 registers.
-#define BOUNDS(n_threads) __launch_bounds__(n_threads, 512 / n_threads)
+// Two blocks of a multiprocessor, which leave a thread 128 registers.
+#define BOUNDS(n_threads) __launch_bounds__(n_threads, 2)
 
-constexpr int ROWS = STEP_ROWS, INNER = STEP_INNER, STAGES = STEP_STAGES;
+constexpr int LANES = STEP_LANES, ROWS = STEP_ROWS, INNER = STEP_INNER, STAGES = STEP_STAGES;
+constexpr int THREADS = STEP_THREADS;
 constexpr int WARP_LANES = 32;
 constexpr int LANE_TILES = WARP_LANES / 16;  // of a warp's results
 constexpr int WORD = 16;                     // bytes
 constexpr int WORD_NUMBERS = 8;              // of a word
 constexpr int ROW_BYTES = 2 * INNER;         // of a part
 constexpr int ROW_WORDS = ROW_BYTES / WORD;  // of a part
+constexpr int STAGE_BYTES = (LANES + ROWS) * ROW_BYTES;
 
 typedef unsigned short Bits;  // of a bfloat16
+
+static_assert(THREADS == 32 * (LANES / WARP_LANES) * 2,
+              "two warps have the rows of a warp's lanes");
 
 extern __shared__ __align__(128) unsigned char shared_memory[];
 
@@ -41,13 +46,11 @@ DEVICE float activate(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
 DEVICE int word_at(int row, int word) { return row * ROW_BYTES + (word ^ (row & 7)) * WORD; }
 
 // What a block and a warp of a core with so many gates compute.
-template <int N_GATES, int N_LANES>
+template <int N_GATES>
 struct Block {
-    static constexpr int GATES = N_GATES, LANES = N_LANES;
+    static constexpr int GATES = N_GATES;
     static constexpr int UNITS = ROWS / GATES, WARP_UNITS = UNITS / 2;
-    static constexpr int UNIT_TILES = WARP_UNITS / 8;  // of a gate's results
-    static constexpr int THREADS = 2 * LANES;
-    static constexpr int STAGE_BYTES = (LANES + ROWS) * ROW_BYTES;
+    static constexpr int UNIT_TILES = WARP_UNITS / 8;     // of a gate's results
     static constexpr int STATE_WORDS = 4 * UNITS / WORD;  // of a lane
     static constexpr bool HAS_OUTPUT = GATES == 4;        // which is multiplied, too
 
@@ -58,7 +61,7 @@ struct Block {
 template <class B>
 DEVICE B find_block(const StepParams& p) {
     int per_row = p.width / B::UNITS, warp = threadIdx.x / 32;
-    return {B::LANES * ((int)blockIdx.x / per_row), B::UNITS * ((int)blockIdx.x % per_row),
+    return {LANES * ((int)blockIdx.x / per_row), B::UNITS * ((int)blockIdx.x % per_row),
             warp / 2 * WARP_LANES, warp % 2 * B::WARP_UNITS};
 }
 
@@ -84,16 +87,16 @@ struct Sums {
 // thread copies.
 template <class B>
 DEVICE void begin_part(int part, const B& block, unsigned int resets, const StepParams& p) {
-    constexpr int STEP = B::THREADS / ROW_WORDS;  // rows that all threads copy at once
-    static_assert(STEP % 8 == 0 && B::LANES % STEP == 0 && ROWS % STEP == 0, "see word_at");
+    constexpr int STEP = THREADS / ROW_WORDS;  // rows that all threads copy at once
+    static_assert(STEP % 8 == 0 && LANES % STEP == 0 && ROWS % STEP == 0, "see word_at");
     int row = threadIdx.x / ROW_WORDS, word = threadIdx.x % ROW_WORDS, of_x = p.width / INNER;
     bool is_output = B::HAS_OUTPUT && part < of_x;
     int first = INNER * (is_output ? part : (block.first_unit / INNER + 1 + part) % of_x);
     first += word * WORD_NUMBERS;
     const Bits* lanes = (const Bits*)(is_output ? p.last_output : p.x) + first;
-    unsigned char* target = shared_memory + part % STAGES * B::STAGE_BYTES + word_at(row, word);
+    unsigned char* target = shared_memory + part % STAGES * STAGE_BYTES + word_at(row, word);
 #pragma unroll
-    for (int i = 0; i < B::LANES / STEP; i++) {
+    for (int i = 0; i < LANES / STEP; i++) {
         const Bits* source = lanes + (long long)lane_of(block, row + i * STEP, p) * p.width;
         unsigned char* to = target + i * STEP * ROW_BYTES;
         if (B::HAS_OUTPUT)
@@ -106,7 +109,7 @@ DEVICE void begin_part(int part, const B& block, unsigned int resets, const Step
 #pragma unroll
     for (int i = 0; i < ROWS; i += STEP) {
         int gate = (row + i) / B::UNITS, unit = block.first_unit + (row + i) % B::UNITS;
-        begin_copy(target + (B::LANES + i) * ROW_BYTES,
+        begin_copy(target + (LANES + i) * ROW_BYTES,
                    weight + (long long)(gate * p.width + unit) * inner);
     }
 }
@@ -120,12 +123,12 @@ DEVICE int state_at(int lane, int word) {
 // Begins to copy the states into the stage of a part after the last.
 template <class B>
 DEVICE void begin_states(unsigned char* states, const B& block, const StepParams& p) {
-    constexpr int STEP = B::THREADS / B::STATE_WORDS;  // lanes that all threads copy at once
-    static_assert(B::LANES * B::STATE_WORDS * WORD <= B::STAGE_BYTES && STEP % 8 == 0, "they fit");
+    constexpr int STEP = THREADS / B::STATE_WORDS;  // lanes that all threads copy at once
+    static_assert(LANES * B::STATE_WORDS * WORD <= STAGE_BYTES && STEP % 8 == 0, "they fit");
     int lane = threadIdx.x / B::STATE_WORDS, word = threadIdx.x % B::STATE_WORDS;
     const float* source = p.last_state + block.first_unit + word * (WORD / 4);
 #pragma unroll
-    for (int i = 0; i < B::LANES; i += STEP)
+    for (int i = 0; i < LANES; i += STEP)
         begin_copy(states + state_at<B>(lane + i, word),
                    source + (long long)lane_of(block, lane + i, p) * p.width);
 }
@@ -154,7 +157,7 @@ DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& blo
     // A thread gives the row of a matrix: of the lanes, matrices go down first, then right; of the
     // weights the other way round.
     int left_at = word_at(block.lanes + thread % 16, thread / 16);
-    int right_at = word_at(B::LANES + block.units + thread / 16 * 8 + thread % 8, thread / 8 % 2);
+    int right_at = word_at(LANES + block.units + thread / 16 * 8 + thread % 8, thread / 8 % 2);
 #pragma unroll
     for (int k = 0; k < ROW_WORDS; k += 2) {
         unsigned int left[LANE_TILES][4], right[B::GATES][B::UNIT_TILES][2];
@@ -272,19 +275,19 @@ DEVICE void write_states(const unsigned char* states, const B& block, long long 
     write_words<B::STATE_WORDS / 2>(p.next_state + first, 4ll * p.width, states, n_lanes, at);
 }
 
-template <int GATES, int LANES>
+template <int GATES>
 DEVICE void step(const StepParams& p) {
-    typedef Block<GATES, LANES> B;
+    typedef Block<GATES> B;
     B block = find_block<B>(p);
     int n_parts = (B::HAS_OUTPUT ? 2 : 1) * p.width / INNER;
     unsigned int resets = 0;
     if (B::HAS_OUTPUT)
 #pragma unroll
-        for (int i = 0; i < LANES * ROW_WORDS / B::THREADS; i++) {
-            int lane = threadIdx.x / ROW_WORDS + i * (B::THREADS / ROW_WORDS);
+        for (int i = 0; i < LANES * ROW_WORDS / THREADS; i++) {
+            int lane = threadIdx.x / ROW_WORDS + i * (THREADS / ROW_WORDS);
             resets |= (p.reset[lane_of(block, lane, p)] ? 1u : 0u) << i;
         }
-    auto stage = [](int i) { return shared_memory + i % STAGES * B::STAGE_BYTES; };
+    auto stage = [](int i) { return shared_memory + i % STAGES * STAGE_BYTES; };
     auto begin = [&](int i) {
         if (i < n_parts)
             begin_part(i, block, resets, p);
@@ -317,5 +320,5 @@ DEVICE void step(const StepParams& p) {
         write_outputs(p.next_output, plain, block, first, p);
 }
 
-INSTANCE(BOUNDS(256) mingru_step, StepParams, step<2, MINGRU_LANES>)
-INSTANCE(BOUNDS(256) lstm_step, StepParams, step<4, LSTM_LANES>)
+INSTANCE(BOUNDS(256) mingru_step, StepParams, step<2>)
+INSTANCE(BOUNDS(256) lstm_step, StepParams, step<4>)
