@@ -3,7 +3,6 @@
 import importlib.util
 import tempfile
 import time
-import zipfile
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,10 +15,10 @@ from megastep.agents.errors import UserError, user_errors
 
 HELP = """Imports floor plans.
 
-  megastep import source=cubicasa path=cubicasa5k.zip      CubiCasa5k: 5,000 real homes
-  megastep import source=houseexpo path=json.tar.gz        HouseExpo: 35,000 homes that people drew
+  megastep import source=cubicasa path=cubicasa5k          CubiCasa5k: 5,000 real homes
+  megastep import source=houseexpo path=json               HouseExpo: 35,000 homes that people drew
 
-The path is what you downloaded: a zip, a tar.gz, the folder or a single file. The database goes to
+The path is the folder of what you downloaded and unpacked, or a single file. The database goes to
 $XDG_DATA_HOME/megastep, or ~/.local/share/megastep, with a report and a contact sheet; then
 geometry=cubicasa and geometry=houseexpo use it, a tenth of the files is the test split.
 
@@ -32,28 +31,25 @@ it. In a drawing walls have the id, class or label `wall`, doors `door`; walls=N
 
   file=plan.npz        where it goes, overwritten if it exists
   licence=accept       confirms the licence
-  per=file             one geometry per file, not per floor, as in the original megastep
-  entrances=open       leaves the doors to the outside open, as there; by default they are closed"""
+  entrances=open       leaves the doors to the outside open; by default they are closed"""
 
-#: Title, place, licence and number of files of the databases.
+#: Title, place and licence of the databases.
 DATABASES = {
     "cubicasa": (
         "CubiCasa5k (Kalervo et al. 2019)",
         "https://zenodo.org/record/2613548",
         "CC BY-NC 4.0: no commercial use, name the authors",
-        5_000,
     ),
     "houseexpo": (
         "HouseExpo (Li et al. 2019)",
         "https://github.com/TeaganLi/HouseExpo",
         "MIT; its plans are from SUNCG, which was withdrawn after a dispute about rights",
-        35_126,
     ),
 }
 MAX_LINES = 1_000  # of a report's lists
 #: The keys that a source has, beside `source` and `path`.
 KEYS = {
-    **dict.fromkeys(DATABASES, ("licence", "per", "entrances")),
+    **dict.fromkeys(DATABASES, ("licence", "entrances")),
     "svg": ("file", "scale", "walls", "doors"),
     "map": ("file", "metres_per_pixel"),
 }
@@ -70,7 +66,6 @@ def run(
     doors: str | None = None,
     metres_per_pixel: Metres | None = None,
     licence: Literal["accept"] | None = None,
-    per: Literal["floor", "file"] | None = None,
     entrances: Literal["sealed", "open"] | None = None,
 ) -> None:
     """Imports floor plans."""
@@ -82,7 +77,7 @@ def run(
             f"importing needs {', '.join(missing)}; pip install {package.DISTRIBUTION}[plans]"
         )
     if source in DATABASES:
-        _import_database(source, Path(path), licence, per or "floor", entrances != "open")
+        _import_database(source, Path(path), licence, entrances != "open")
         return
     marks = {key: name for key, name in (("walls", walls), ("doors", doors)) if name}
     _import_own(source, Path(path), file, scale, metres_per_pixel, marks)
@@ -119,24 +114,24 @@ def _import_own(source, path, file, scale, metres_per_pixel, marks) -> None:
     )
 
 
-def _import_database(source, path, licence, per, is_sealed) -> None:
+def _import_database(source, path, licence, is_sealed) -> None:
     start = time.monotonic()
     if not path.exists():
         raise UserError(f"path={path} does not exist")
-    title, place, terms, n_known = DATABASES[source]
+    title, place, terms = DATABASES[source]
     console.say(f"{title}\n  from {place}\n  licence: {terms}")
     if licence is None:
         raise UserError("the licence is not confirmed; licence=accept does so")
     from megastep.geometries import databases
     from megastep.geometries.plans import imports, sheets
 
-    options, suffix = imports.Options(source, per, is_sealed), imports.READERS[source].SUFFIX
+    options, suffix = imports.Options(source, is_sealed), imports.READERS[source].SUFFIX
     folder = databases.imported_path(source).parent
     with user_errors(f"{folder} cannot be written: ", (OSError,)):  # before all is read
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     with console.counting("files"), user_errors():
-        n_files = _n_files(path, suffix) or n_known
+        n_files = sum(1 for _ in path.rglob(f"*{suffix}"))
         plans = imports.run(options, path, lambda n: console.count(n, max(n, n_files)))
     geometries = [g for plan in plans for g in plan.geometries]
     numbers = [i for i, plan in enumerate(plans) for _ in plan.geometries]
@@ -155,19 +150,9 @@ def _import_database(source, path, licence, per, is_sealed) -> None:
     )
 
 
-def _n_files(path, suffix) -> int | None:
-    """Returns the number of files to read; None of a tar.gz, which only reading it would tell."""
-    if path.is_dir():
-        return sum(1 for _ in path.rglob(f"*{suffix}"))
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            return sum(name.endswith(suffix) for name in archive.namelist())
-    return None
-
-
 def _report(source, path, plans, n) -> str:
     """Returns the report of an import in Markdown."""
-    title, _, licence, _ = DATABASES[source]
+    title, _, licence = DATABASES[source]
     notes = [(plan.name, note) for plan in plans for note in plan.notes]
     refused = [(plan.name, plan.refusal) for plan in plans if plan.refusal]
     n_rooms, n_reachable = (sum(note[i] for _, note in notes) for i in (0, 1))

@@ -22,10 +22,8 @@ TOLERANCE = outlines.GRID / 2  # metres, by which contours are simplified
 SKIPPED = ("defs", "script", "foreignObject", "use", "text", "symbol", "clipPath", "mask")
 
 
-def read(content: bytes, per: str = "floor") -> list[Drawing]:
-    """Returns the drawings of a file, one per floor, or one of all floors with `per="file"`. Raises
-    ValueError.
-    """
+def read(content: bytes) -> list[Drawing]:
+    """Returns the drawings of a file, one per floor. Raises ValueError."""
     if len(content) > MAX_BYTES:
         raise ValueError(f"it has {len(content):,} bytes, but the limit is {MAX_BYTES:,}")
     root = safe.svg(content)
@@ -35,9 +33,6 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
         _collect(floor, matrix, drawing)
     if not floors:
         raise ValueError("it has no group of class Floorplan; is it from CubiCasa5k?")
-    if per == "file":
-        walls, rooms, doors, outdoors = (sum(parts, []) for parts in zip(*(f[:4] for f in floors)))
-        floors = [Drawing(walls, rooms, doors, outdoors)]
     floors = [floor for floor in floors if any(floor[:4])]
     if not floors:
         raise ValueError("its floor plan is empty")

@@ -26,7 +26,7 @@ def _refuse(text) -> float:
     raise ValueError(f"it has the number {text}")
 
 
-def read(content: bytes, per: str = "floor") -> list[Drawing]:
+def read(content: bytes) -> list[Drawing]:
     """Returns the drawing of a file, in a list. Raises ValueError."""
     try:
         plan = json.loads(content, parse_constant=_refuse)

@@ -1,4 +1,4 @@
-"""Imports the floor plans of an archive or folder, in parallel processes, or one of one's own."""
+"""Imports the floor plans of a folder, in parallel processes, or one of one's own."""
 
 import contextlib
 import functools
@@ -43,7 +43,6 @@ class Options(NamedTuple):
     """How plans are read."""
 
     source: str
-    per: str = "floor"
     sealed: bool = True
 
 
@@ -104,7 +103,7 @@ def _read(options, member) -> Plan:
     reader, homes, refusals = READERS[options.source], [], []
     if member.content is None:
         raise ValueError(member.refusal)
-    for drawing in reader.read(member.content, options.per):
+    for drawing in reader.read(member.content):
         try:
             homes.append((*_home(drawing, options.sealed, reader.TOLERANCE), drawing))
         except Exception as error:
@@ -120,7 +119,7 @@ def _read(options, member) -> Plan:
 def run(
     options: Options, path: Path, show: Callable[[int], None], processes: int | None = None
 ) -> list[Plan]:
-    """Returns the plans of all files of an archive, folder or file, sorted by name, with the
+    """Returns the plans of all files of a folder, or of a file, sorted by name, with the
     drawings of the first. `show` is called with the number of files that are read, by as many
     `processes`; None: one per core. Raises ValueError if none is a plan, or one is damaged.
     """
