@@ -1,6 +1,6 @@
 """Wrappers around any environment, on its device: `env.wrappers=[sticky_actions]`."""
 
-from megastep.wrappers.actions import ActionRepeat, NoisyActions, StickyActions, TimeLimit
+from megastep.wrappers.actions import NoisyActions, StickyActions, TimeLimit
 from megastep.wrappers.base import Wrapper
 from megastep.wrappers.robots import Latency, OdometryDrift
 from megastep.wrappers.worlds import (
@@ -14,7 +14,6 @@ from megastep.wrappers.worlds import (
 
 __all__ = [
     "WRAPPERS",
-    "ActionRepeat",
     "ClipReward",
     "DropSensor",
     "FrameStack",
@@ -31,7 +30,6 @@ __all__ = [
 
 #: Wrappers by their names in settings.
 WRAPPERS = {
-    "action_repeat": ActionRepeat,
     "clip_reward": ClipReward,
     "drop_sensor": DropSensor,
     "frame_stack": FrameStack,

@@ -1,7 +1,7 @@
 """Wrappers that change actions or the length of episodes."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, cast
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -9,10 +9,10 @@ from pydantic import Field
 from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.settings import checked
-from megastep.types import Env, Tree, n_lanes, optional
+from megastep.types import Env, Tree, n_lanes
 from megastep.wrappers.base import Draws, Levels, Wrapper, along
 
-__all__ = ["ActionRepeat", "NoisyActions", "StickyActions", "TimeLimit"]
+__all__ = ["NoisyActions", "StickyActions", "TimeLimit"]
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -124,57 +124,6 @@ def normal(numbers: torch.Tensor) -> torch.Tensor:
     """
     a, b, c, d = numbers.unbind(-1)
     return ((a + b) + (c + d) - 2.0) * 3**0.5
-
-
-class ActionRepeat(Wrapper):
-    """Takes each action several times, and returns the last world with the sum of the rewards. An
-    episode that ends in between ends there.
-
-    Args:
-        env: the environment inside, with ``reset(seed=None, mask=None)``.
-        n: steps of the environment inside per step.
-    """
-
-    @checked
-    def __init__(self, env: Env, *, n: Annotated[int, Field(ge=1, le=1000)] = 4):
-        super().__init__(env)
-        self.require_masks("begins episodes of lanes that ended before the others")
-        self.n = n
-        self.ended = torch.zeros(n_lanes(env), dtype=torch.bool, device=env.device)
-
-    @property
-    def fps(self) -> float:
-        """Steps per second of simulated time."""
-        return optional(self.env, "fps") / self.n
-
-    def step(self, decision: Mapping) -> arrdict:
-        """Takes n steps. Returns a world."""
-        is_over, total = self.ended.clone(), torch.zeros(n_lanes(self.env), device=self.device)
-        kept: Any = None
-        for _ in range(self.n):
-            world = self.env.step(arrdict(actions=decision["actions"]))
-            total = total + world.reward.masked_fill(is_over, 0.0)
-            ends = (world.terminal | world.truncated) & ~is_over
-            is_over = is_over | ends
-            kept = world.clone() if kept is None else _where(ends, world, kept)
-        ended_now = is_over & ~self.ended
-        world = _where(ended_now, kept, self.restarted(self.ended))
-        world = arrdict(world, reward=total.masked_fill(world.reset, 0.0))
-        self.ended.copy_(world.terminal | world.truncated)
-        return self._resets.keep(world)
-
-    def after(self, world: arrdict) -> arrdict:
-        """Notes that no episode has ended, at a reset."""
-        self.ended.copy_(world.terminal | world.truncated)
-        return world
-
-
-def _where(condition, chosen, other) -> arrdict:
-    """Returns the lanes of one world where a condition (B,) is true, those of another else."""
-    if isinstance(chosen, Mapping):
-        parts = {key: _where(condition, part, other[key]) for key, part in chosen.items()}
-        return arrdict(parts)
-    return cast(arrdict, torch.where(along(condition, chosen), chosen, other))
 
 
 class TimeLimit(Wrapper):

@@ -73,7 +73,7 @@ CASES = {
     "wrappers": [
         *("env=explorer", "env.res=8", *SMALL, "learner.n_minibatches=2"),
         "env.wrappers=[sticky_actions,{name:frame_stack,n:3},{name:time_limit,n:7},"
-        "{name:action_repeat,n:2},{name:noisy_sensor,sensor:imu}]",
+        "{name:noisy_sensor,sensor:imu}]",
     ],
     "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[2:]],
 }

@@ -12,7 +12,6 @@ from megastep.capture import Captured
 from megastep.modules import Robot
 from megastep.wrappers import (
     WRAPPERS,
-    ActionRepeat,
     ClipReward,
     DropSensor,
     FrameStack,
@@ -80,7 +79,6 @@ def minimal(device="cpu", **settings):
 
 
 SETTINGS = {
-    "action_repeat": dict(n=3),
     "clip_reward": {},
     "drop_sensor": dict(sensor="rgb", probability=0.5),
     "frame_stack": dict(n=3),
@@ -254,19 +252,6 @@ def test_a_time_limit_truncates_and_the_next_step_begins_an_episode():
         assert bool(world.reset[0]) == (ages[-1] == 0) and not bool(world.terminal[0])
     assert ages == [1, 2, 3, 0, 1, 2, 3, 0]
     assert cuts == [False, False, True, False] * 2
-
-
-def test_an_action_is_repeated_until_an_episode_ends():
-    """The episode of lane 0 lasts 5 steps: two of three steps, the second one cut short."""
-    env = ActionRepeat(Counting(3), n=3)
-    world, rows = env.reset(), []
-    for _ in range(6):
-        world = env.step(ones(env))
-        flags = bool(world.reset[0]), bool(world.terminal[0])
-        rows.append((int(world.obs.age[0, 0, 0]), float(world.reward[0]), *flags))
-    one = [(3, 3.0, False, False), (5, 2.0, False, True), (0, 0.0, True, False)]
-    assert rows == 2 * one
-    assert env.fps == pytest.approx(10 / 3)
 
 
 def test_sensors_fail_and_are_noisy():
