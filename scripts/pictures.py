@@ -7,6 +7,7 @@ python scripts/pictures.py gallery            docs/play alone, which the reposit
 """
 
 import argparse
+import functools
 import sys
 import tempfile
 from pathlib import Path
@@ -36,6 +37,7 @@ FILMS = {
     "keys.png": "run=keys_anywhere steps=60",
     "minimal.png": "env=minimal geometry=box steps=20",
     "pong-court.png": "env=pong steps=30",
+    "minigrid.png": "run=DOORKEY steps=12 seed=4 dpi=70",
 }
 SHEETS = {
     "dense-homes.png": "--count 10 --density 3",
@@ -66,14 +68,18 @@ MOVING = {
     "keys.mp4": "run=keys_anywhere steps=160 dpi=70 speed=2",
     "minimal.mp4": "env=minimal geometry=box steps=100 dpi=80",
     "pong-court.mp4": "run=PONG steps=200 dpi=80",
+    "minigrid.mp4": "run=DOORKEY steps=150 dpi=80",
 }
 MOVING |= {
     f"{name}.mp4": f"run=explorer_anywhere {words} steps=120 dpi=50 speed=2"
     for name, words in SOURCES.items()
 }
-#: Trains the agent that plays Pong in it.
-PONG = "env=pong env.n_envs=64 env.points=1 agent.core=none agent.width=32 learner.n_minibatches=8 "
-PONG += "samples=200000 device=cpu"
+#: Trains agents that pictures, films and pages name.
+TRAINED = {
+    "PONG": "env=pong env.n_envs=64 env.points=1 agent.core=none agent.width=32 "
+    "learner.n_minibatches=8 samples=200000 device=cpu",
+    "DOORKEY": "experiment=minigrid env.id=MiniGrid-DoorKey-6x6-v0 samples=1000000 device=cpu",
+}
 #: Words for megastep web.
 GALLERY = {
     "explorer.html": "run=explorer_anywhere homes=[3,0,1,2]",
@@ -81,6 +87,7 @@ GALLERY = {
     "memory.html": "run=memory_9",
     "keys.html": "run=keys_anywhere",
     "pointgoal.html": "run=pointgoal_anywhere homes=[4,0,1]",
+    "minigrid.html": "run=DOORKEY",
 }
 
 
@@ -88,16 +95,29 @@ def filmed(words: str, path: Path) -> None:
     """Writes a picture or a film.
 
     Args:
-        words: for record.py; in them PLAN is the file of a drawn floor plan, and PONG an agent.
+        words: for record.py; in them PLAN is the file of a drawn floor plan.
     """
     with tempfile.TemporaryDirectory() as folder:
         if "PLAN" in words:
             files.save(f"{folder}/plan.npz", [draw_plans.curved_house()])
-        if "PONG" in words:
-            train.main([*PONG.split(), f"folder={folder}/pong"])
-        words = words.replace("PLAN", f"{folder}/plan.npz").replace("PONG", f"{folder}/pong")
+        words = trained(words.replace("PLAN", f"{folder}/plan.npz"))
         if code := record.main([*words.split(), "device=cpu", f"file={path}"]):
             raise SystemExit(code)
+
+
+@functools.cache
+def agent(name: str) -> str:
+    """Trains one of `TRAINED`. Returns its folder."""
+    folder = f"{tempfile.mkdtemp()}/{name.lower()}"
+    train.main([*TRAINED[name].split(), f"folder={folder}"])
+    return folder
+
+
+def trained(words: str) -> str:
+    """Returns words with the folders of the agents that they name."""
+    for name in TRAINED:
+        words = words.replace(name, agent(name)) if name in words else words
+    return words
 
 
 def main(argv=None):
@@ -116,7 +136,7 @@ def main(argv=None):
         elif name == OWN_PLANS:
             draw_plans.sheet(path)
         elif name in GALLERY:
-            web.main([*GALLERY[name].split(), f"file={PAGES / name}"])
+            web.main([*trained(GALLERY[name]).split(), f"file={PAGES / name}"])
         elif name in MOVING:
             filmed(MOVING[name], PAGES / name)
         else:
