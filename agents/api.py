@@ -96,9 +96,11 @@ class Run:
         environments, or in others if a geometry is given; by default in the split `test`. `changes`
         are `split`, `seed`, `device`, `privileged`, and settings of the environment.
         """
-        own = {key: self.config[key] for key in ("env", "geometry")}
-        if own["geometry"].get("n"):
-            own["geometry"] = own["geometry"] | {"n": min(n_envs, own["geometry"]["n"])}
+        own = {"env": self.config["env"]}
+        if components.takes_geometries(own["env"]["name"]):
+            own["geometry"] = self.config["geometry"]
+            if own["geometry"].get("n"):
+                own["geometry"] = own["geometry"] | {"n": min(n_envs, own["geometry"]["n"])}
         if geometry is not None:
             own["geometry"] = geometry
         return make(**{"split": "test", **own, "n_envs": n_envs, **changes})

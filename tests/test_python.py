@@ -79,6 +79,13 @@ def test_a_line_of_python_has_the_settings_of_its_command(typed, line, monkeypat
         assert compose.settings_from(tiny.load(name), arguments) == expected
 
 
+def test_a_run_without_floor_plans_gives_its_policy_and_environment(here):
+    small = {key: value for key, value in TINY.items() if key not in ("env", "geometry")}
+    run = megastep.train(**small | {"env": {"name": "pong", "n_envs": 4}}, samples=64, folder="run")
+    (row,) = megastep.evaluate(run.policy, env=run.make(n_envs=3, limit=9))
+    assert row["lanes"] == 3
+
+
 def test_a_run_from_training_to_film(here, capsys):
     run = megastep.train(**TINY, samples=256, folder="run")
     assert str(run.folder) == "run"

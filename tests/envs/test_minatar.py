@@ -9,7 +9,9 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves as leaves
 
+import megastep
 from megastep import envs
+from megastep.agents.cli import train
 from megastep.arrdict import arrdict
 from megastep.envs.minatar import ACTIONS
 from tests.helpers.pong_twins import philox
@@ -37,13 +39,13 @@ class OurDraws:
         return draws[0] if size is None else np.array(draws)
 
 
-def original(game, **words):
-    logging.disable(logging.WARNING)  # that it cannot draw
+def imported(name):
+    """Returns a module of the original, which warns that it cannot draw."""
+    logging.disable(logging.WARNING)
     try:
-        environment = pytest.importorskip("minatar.environment")
+        return pytest.importorskip(name)
     finally:
         logging.disable(logging.NOTSET)
-    return environment.Environment(game, **words)
 
 
 def state_of(env):
@@ -76,7 +78,8 @@ def play(game, n_envs, n_episodes, seed, n_plans=0, **settings):
     ours = envs.MinAtar(n_envs, id=game, seed=seed, device="cpu", **settings)
     words = dict(sticky_action_prob=settings.get("sticky", 0.1))
     words |= dict(difficulty_ramping=settings.get("ramping", True))
-    theirs = [original(game, **words) for _ in range(n_envs)]
+    original = imported("minatar.environment")
+    theirs = [original.Environment(game, **words) for _ in range(n_envs)]
     numbers = theirs[0].minimal_action_set()
     for e, env in enumerate(theirs):
         env.random = env.env.random = OurDraws(e, seed)
@@ -122,6 +125,32 @@ def test_equals_the_original_without_sticky_actions_and_ramping(game="asterix"):
     play(game, n_envs=8, n_episodes=1, seed=5, limit=300, sticky=0, ramping=False)
 
 
+def test_breakout_in_any_state_equals_the_original():
+    """Few games come to where a ball is between bricks."""
+    n, random, original = 400, np.random.default_rng(1), imported("minatar.environment")
+    ours = envs.MinAtar(n, sticky=0, device="cpu")
+    ours.reset()
+    theirs = [original.Environment("breakout", sticky_action_prob=0) for _ in range(n)]
+    for e, env in enumerate(theirs):
+        env.reset()
+        game = env.env
+        game.ball_x, game.ball_y, game.ball_dir = random.integers((10, 5, 4))
+        game.brick_map[1:4] = bricks = random.integers(2, size=(3, 10))
+        bits = int((bricks.flatten() << np.arange(30)).sum())
+        ball = game.ball_x, game.ball_y, game.last_x, game.last_y, game.ball_dir
+        ours.games[4:, e] = torch.tensor([*ball, game.pos, 0, bits])
+    alive = np.ones(n, bool)
+    for _ in range(12):
+        actions = random.integers(3, size=(n, 1))
+        world = ours.step(arrdict(actions=torch.from_numpy(actions)))
+        for e in alive.nonzero()[0]:
+            reward, done = theirs[e].act([0, 1, 3][actions[e, 0]])
+            assert (float(world.reward[e]), bool(world.terminal[e])) == (reward, done)
+            assert np.array_equal(world.obs[e, 0].permute(1, 2, 0).numpy(), theirs[e].state())
+        alive &= ~world.terminal.numpy()
+    assert alive.sum() > 20
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("game", ["seaquest", "space_invaders"])
 def test_equals_the_original_when_played_well(game):
@@ -132,6 +161,36 @@ def test_equals_the_original_when_played_well(game):
 @every_game
 def test_equals_the_original_for_a_thousand_episodes(game):
     print(game, *play(game, n_envs=1000, n_episodes=1, seed=7, n_plans=2))
+
+
+@pytest.mark.nightly
+def test_an_agent_trained_here_earns_the_same_in_the_original(here):
+    words = ["experiment=minatar", "device=cpu", "agent.encoder=linear", "agent.width=32"]
+    assert train.main([*words, "samples=200000", "seconds=null", "folder=run"]) == 0
+    run, n = megastep.load("run"), 128
+    (row,) = run.evaluate(episodes=1024, baseline="none")
+    policy = run.policy
+    original = imported("minatar.gym")
+    theirs = [original.BaseEnv("breakout", use_minimal_action_set=True) for _ in range(n)]
+    state, generator = policy.initial(n), torch.Generator().manual_seed(1)
+    obs = np.stack([env.reset(seed=e)[0] for e, env in enumerate(theirs)])
+    returns, totals, has_ended = [[] for _ in theirs], np.zeros(n), np.ones(n, bool)
+    while min(map(len, returns)) < 4:
+        images = torch.from_numpy(obs).permute(0, 3, 1, 2)[:, None].byte()
+        world = arrdict(obs=images, reset=torch.from_numpy(has_ended))
+        decision, state = policy(world, state, generator=generator)
+        steps = [env.step(int(a)) for env, a in zip(theirs, decision.actions[:, 0])]
+        totals += [step[1] for step in steps]
+        has_ended = np.array([step[2] for step in steps])
+        obs = np.stack([step[0] for step in steps])
+        for e in has_ended.nonzero()[0]:
+            returns[e].append(totals[e])
+            totals[e], obs[e] = 0, theirs[e].reset()[0]
+    their_returns = np.array([lane[:4] for lane in returns]).flatten()
+    error = np.hypot(
+        their_returns.std() / len(their_returns) ** 0.5, (row["upper"] - row["lower"]) / 4
+    )
+    assert row["return"] > 2 and abs(their_returns.mean() - row["return"]) < 4 * error
 
 
 @pytest.mark.cuda
