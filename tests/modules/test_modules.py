@@ -270,6 +270,14 @@ def test_wrong_continuous_actions_are_named():
         move(dict(actions=right.view(shape)))
 
 
+def test_imu_is_in_fractions_of_a_turn_per_second_and_of_10_m_s():
+    c = core_of([toys.box()])
+    c.agents.angles.fill_(90.0)
+    c.agents.angvelocity.fill_(90.0)
+    c.agents.velocity.copy_(torch.tensor([-1.0, 5.0]))
+    assert torch.allclose(modules.IMU(c)(), torch.tensor([0.25, 0.5, 0.1]), rtol=0, atol=1e-6)
+
+
 def test_continuous_actions_are_fractions_of_the_speeds():
     """10 m/s and 180 degrees/s for a tenth of a second; the agent faces +y."""
     c = core_of([toys.box()])
