@@ -13,7 +13,7 @@ from megastep import spaces
 from megastep.agents.algorithms import learner
 from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.agents.networks.policy import Policy
-from megastep.agents.networks.running_norm import masked_moments
+from megastep.agents.networks.running_norm import add_moments, masked_moments
 from megastep.agents.storage.dataset import DatasetCollector
 from megastep.agents.storage.rollout import make_rollout, without_last
 from megastep.agents.types import CollectorLike
@@ -105,7 +105,7 @@ class BC(learner.GradientLearner):
             # the next rollout goes on from here
             for leaf, new in zip(leaves(rollout.state), leaves(state), strict=True):
                 leaf.index_copy_(0, lanes, new.detach().to(leaf.dtype).nan_to_num(0.0, 0.0, 0.0))
-        policy.add_moments(of_obs, is_finite)
+        add_moments(policy.norms, of_obs, is_finite)
         return self.steps.end()
 
     def _losses(self, batch) -> tuple[torch.Tensor, dict[str, torch.Tensor], dict]:

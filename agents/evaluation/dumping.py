@@ -19,10 +19,11 @@ import numpy as np
 import torch
 
 from megastep import data, spaces
-from megastep.agents import console, factory
+from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import eval_env
 from megastep.agents.factory import check, components, env_failures, settings
+from megastep.agents.factory import make as factory
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.storage.collector import Collector
