@@ -135,7 +135,8 @@ class Run:
 
     def began(self) -> None:
         """Writes what all ranks have made."""
-        hosts = process_group.gather_objects(process_group.hostname())
+        is_alone = self.n_ranks == 1
+        hosts = [] if is_alone else process_group.gather_objects(process_group.hostname())
         lost = process_group.gather_objects(self.training.lost)
         from_rank_0(lambda: record(self.training, self.device, hosts))
         if clauses := dict.fromkeys(itertools.chain(*lost)):

@@ -1,6 +1,7 @@
 """Provenance of a run: code version, machine and command, one line per start."""
 
 import contextlib
+import json
 import os
 import platform
 import re
@@ -14,7 +15,6 @@ from pathlib import Path
 import torch
 
 from megastep.agents import package
-from megastep.agents.runs.json_lines import JsonLines
 
 FILE = "provenance.jsonl"
 
@@ -23,7 +23,7 @@ def record(folder: Path, samples: int, device: torch.device, hosts: Sequence[str
     """Appends a line to a run's `provenance.jsonl`, after so many samples, on a device and on the
     machine of each rank. Never raises; unknown facts are omitted.
     """
-    with contextlib.suppress(Exception), contextlib.closing(JsonLines(folder / FILE)) as lines:
+    with contextlib.suppress(Exception), open(folder / FILE, "a") as file:
         facts = {
             "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
             "command": shlex.join(sys.orig_argv),
@@ -36,7 +36,8 @@ def record(folder: Path, samples: int, device: torch.device, hosts: Sequence[str
             "ranks": len(hosts) if len(hosts) > 1 else None,
             "hosts": ", ".join(dict.fromkeys(hosts)) if len(hosts) > 1 else None,
         }
-        lines.write(samples, {name: text for name, text in facts.items() if text})
+        known = {name: text for name, text in facts.items() if text}
+        file.write(json.dumps({"samples": samples, **known}) + "\n")
 
 
 def made_with(device: torch.device, n_ranks: int = 1) -> dict[str, str | int]:

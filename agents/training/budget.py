@@ -81,9 +81,8 @@ def reaches(evaluation: Mapping[str, float], stop: Mapping[str, float]) -> bool:
 class Stopwatch:
     """Counts seconds of training, from `start` on: after the first update, which compiles."""
 
-    def __init__(self) -> None:
-        self.seconds_before = 0.0  # that the run had trained before it was resumed
-        self.started: float | None = None
+    seconds_before = 0.0  # that the run had trained before it was resumed
+    started: float | None = None
 
     def start(self) -> None:
         """Starts counting."""
