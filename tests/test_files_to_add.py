@@ -104,6 +104,7 @@ ADDED = {
 
 
             COMMAND = Command("greet", run, "Says hello.")
+            main = COMMAND.main
             """,
         "agents/cli/entry.py": """
 

@@ -33,3 +33,4 @@ def run(path: str) -> None:
 
 
 COMMAND = Command("check", run, HELP)
+main = COMMAND.main

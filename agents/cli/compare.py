@@ -38,3 +38,4 @@ def run(
 
 
 COMMAND = Command("compare", run, HELP)
+main = COMMAND.main

@@ -7,8 +7,8 @@ from megastep.agents import package
 from megastep.agents.errors import UserError
 from megastep.agents.launch import signals
 
-#: The commands, each a module of this package with a `COMMAND`, but for `rerun`, which is `train
-#: rerun=`.
+#: The commands, each a module of this package with `main(words) -> int`, the exit code, but for
+#: `rerun`, which is `train rerun=`.
 COMMANDS = {
     "train": "trains a policy; --help says more",
     "evaluate": "measures a trained policy; --help says more",
@@ -60,7 +60,7 @@ def run_command(name: str, words: list[str] | None = None) -> int:
             if not words:
                 raise UserError("takes a run: its folder, or latest")
             name, words = "train", [f"rerun={words[0]}", *words[1:]]
-        return importlib.import_module(f"megastep.agents.cli.{name}").COMMAND.main(words)
+        return importlib.import_module(f"megastep.agents.cli.{name}").main(words)
     except UserError as error:
         console.say(f"{package.command(name)}: {error}", sys.stderr)
         return error.code

@@ -45,3 +45,4 @@ def run(
 
 
 COMMAND = Command("export", run, HELP)
+main = COMMAND.main

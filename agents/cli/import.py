@@ -173,3 +173,4 @@ def _report(source, path, plans, n) -> str:
 
 
 COMMAND = Command("import", run, HELP)
+main = COMMAND.main

@@ -81,3 +81,4 @@ def _parts(state: "StateDict | None") -> Iterator[str]:
 
 
 COMMAND = Command("inspect", run, HELP)
+main = COMMAND.main

@@ -35,3 +35,4 @@ def page(file: str | None, default: Path) -> Path:
 
 
 COMMAND = Command("report", run, HELP)
+main = COMMAND.main

@@ -142,3 +142,4 @@ def compare(name: str, row: dict, folder: Path, found: list[Interval]) -> int:
 
 
 COMMAND = Command("reproduce", run, HELP)
+main = COMMAND.main

@@ -44,3 +44,4 @@ def run(
 
 
 COMMAND = Command("web", run, HELP)
+main = COMMAND.main

@@ -278,7 +278,7 @@ def test_a_head_is_not_needed_to_play(here):
     sys.modules.pop("mine")
     assert evaluate.main(["run=run", "episodes=4", "device=cpu", "baseline=none"]) == 0
     assert record.main(["run=run", "steps=2", "file=a.png", "device=cpu"]) == 0
-    assert export.COMMAND.main(["run=run", "format=safetensors", "file=a.safetensors"]) == 0
+    assert export.main(["run=run", "format=safetensors", "file=a.safetensors"]) == 0
     assert train.main([*TINY, "init=run", "samples=32", "folder=other"]) == 0
 
 

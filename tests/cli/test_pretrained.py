@@ -45,8 +45,9 @@ def exported(tmp_path_factory):
         shutil.copytree("run", "mine")  # a run that a colleague lacks
         for words in ([], ["against=mine,bot"]):
             assert evaluate.main(["run=run", *SUITE, *words]) == 0
-        words = ["run=run", "format=safetensors", f"file=agents/{NAME}.safetensors"]
-        assert export.COMMAND.main(words) == 0
+        assert (
+            export.main(["run=run", "format=safetensors", f"file=agents/{NAME}.safetensors"]) == 0
+        )
     return folder
 
 
@@ -120,7 +121,7 @@ def test_export_refuses(words, text, exported, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(exported)
     run, name = words
     file = f"file={tmp_path}/new/{name}.safetensors"
-    assert export.COMMAND.main([f"run={run}", "format=safetensors", file]) == 2
+    assert export.main([f"run={run}", "format=safetensors", file]) == 2
     assert re.search(text, capsys.readouterr().err)
     assert not (tmp_path / "new").exists()
 
@@ -182,11 +183,11 @@ def test_loads_in_python_and_acts_as_the_run(folder, exported):
 
 
 def test_inspect_prints_what_is_in_a_file(file, capsys):
-    assert inspect.COMMAND.main([NAME]) == 0
+    assert inspect.main([NAME]) == 0
     out = capsys.readouterr().out
     assert f"{NAME}.safetensors: intact" in out and "samples: 512" in out and "policy" in out
     file.write_bytes(file.read_bytes()[:-1] + b"!")
-    assert inspect.COMMAND.main([NAME]) == 1
+    assert inspect.main([NAME]) == 1
     assert "SHA-256" in capsys.readouterr().out
 
 

@@ -123,7 +123,7 @@ def test_a_training_that_fails_ends_the_command_with_its_code(tmp_path, monkeypa
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setattr(train, "main", lambda words: 130)
     monkeypatch.setattr(evaluate, "main", None)
-    assert reproduce.COMMAND.main(["pong-cpu"]) == 130
+    assert reproduce.main(["pong-cpu"]) == 130
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def test_export_writes_a_card_whose_commands_work_for_a_colleague(here, monkeypa
     assert train.main(words) == 0
     assert evaluate.main(["run=run", "episodes=8", "device=cpu", "baseline=none"]) == 0
     words = ["run=run", "format=safetensors", "file=far/heist_agent.safetensors"]
-    assert export.COMMAND.main(words) == 0
+    assert export.main(words) == 0
     card = (path := here / "far/heist_agent.md").read_text()
     assert card.startswith("# heist_agent\n") and "`env=heist:Heist`" in card
     assert "It needs `heist:Heist`" in card and "icence" not in card
@@ -52,11 +52,11 @@ def test_export_writes_a_card_whose_commands_work_for_a_colleague(here, monkeypa
     path.write_text(card.replace("A baseline, ", "The best thief, "))
     for left_out in (here / "run/provenance.jsonl", *here.glob("run/evaluations/*")):
         left_out.unlink()
-    assert export.COMMAND.main(words) == 0
+    assert export.main(words) == 0
     again = path.read_text()
     assert "The best thief, " in again and "Not evaluated." in again and "- command" not in again
     path.write_text("Notes\n")
-    assert export.COMMAND.main(words) == 0
+    assert export.main(words) == 0
     assert path.read_text() == "Notes\n"
 
 

@@ -130,7 +130,7 @@ def test_an_agent_of_gymnasium_is_exported(here):
         pytest.importorskip(name)
     words = [*TINY[2:3], *TINY[4:], "env=gymnasium", "env.id=CartPole-v1", "samples=256"]
     assert train.main([*words, "env.wrappers=[{name:frame_stack,n:2}]", "folder=run"]) == 0
-    assert export.COMMAND.main(["run=run", "format=onnx", "file=a.onnx"]) == 0
+    assert export.main(["run=run", "format=onnx", "file=a.onnx"]) == 0
     import onnxruntime
 
     session = onnxruntime.InferenceSession("a.onnx")
@@ -171,5 +171,5 @@ def test_a_core_that_cannot_be_exported_is_one_sentence(tmp_path):
     ],
 )
 def test_bad_words_are_one_sentence(words, text, here, capsys):
-    assert export.COMMAND.main(words) == 2 and text in capsys.readouterr().err
+    assert export.main(words) == 2 and text in capsys.readouterr().err
     assert not any(here.iterdir())

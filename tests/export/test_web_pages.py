@@ -45,7 +45,7 @@ def data_of(path):
 
 
 def test_a_page_of_a_run_is_in_its_folder(folder, capsys):
-    assert web.COMMAND.main([f"run={folder / 'pong'}"]) == 0
+    assert web.main([f"run={folder / 'pong'}"]) == 0
     path = folder / "pong/page.html"
     assert f"Wrote {path}, 0." in capsys.readouterr().out
     data = data_of(path)
@@ -56,11 +56,11 @@ def test_a_page_of_a_run_is_in_its_folder(folder, capsys):
 
 def test_opponents_homes_and_seeds_are_chosen(folder, tmp_path):
     words = [f"run={folder / 'pong'}", f"against={folder / 'pong'}", "seed=7"]
-    assert web.COMMAND.main([*words, f"file={tmp_path / 'new/duel.html'}"]) == 0
+    assert web.main([*words, f"file={tmp_path / 'new/duel.html'}"]) == 0
     data = data_of(tmp_path / "new/duel.html")
     assert data["seed"] == 7 and [one["lanes"] for one in data["policies"]] == [[0, 1], [1, 2]]
     path = tmp_path / "explorer.html"
-    assert web.COMMAND.main([f"run={folder / 'explorer'}", "homes=[0]", f"file={path}"]) == 0
+    assert web.main([f"run={folder / 'explorer'}", "homes=[0]", f"file={path}"]) == 0
     data = data_of(path)
     assert data["homes"] == ["0"] and len(data["rooms"]) == 1
     assert data["controls"]["ArrowLeft"] == 5
@@ -83,7 +83,7 @@ def test_opponents_homes_and_seeds_are_chosen(folder, tmp_path):
 )
 def test_what_cannot_be_is_said(words, sentence, folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert web.COMMAND.main([word.format(folder) for word in words]) == 2
+    assert web.main([word.format(folder) for word in words]) == 2
     assert re.search(sentence, capsys.readouterr().err)
     assert not [*tmp_path.iterdir()]
 

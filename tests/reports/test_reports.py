@@ -77,7 +77,7 @@ class Page(HTMLParser):
 
 
 def test_report_of_a_run(here, capsys):
-    assert report.COMMAND.main(["run=e"]) == 0
+    assert report.main(["run=e"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "Report: e/report.html"
     page = Page(here / "e/report.html")
     assert len(page.text) < 5_000_000 and page.loads == []
@@ -99,7 +99,7 @@ def test_report_of_a_run(here, capsys):
 
 
 def test_runs_that_differ_in_seeds_are_averaged(here):
-    assert report.COMMAND.main(["run=[a,b,c]", "file=all.html"]) == 0
+    assert report.main(["run=[a,b,c]", "file=all.html"]) == 0
     page = Page(here / "all.html")
     (results,) = (page.rows[1:3],)
     assert [row[:2] for row in results] == [["learner.lr=0.003", "2"], ["learner.lr=0.0001", "1"]]
@@ -127,12 +127,12 @@ def test_folder_of_a_sweep_stands_for_its_jobs(here, tmp_path):
     for name in "ac":
         shutil.copytree(here / name, tmp_path / "sweep" / name)
     assert [path.name for path in runs.expanded([str(tmp_path / "sweep")])] == ["a", "c"]
-    assert report.COMMAND.main([f"run={tmp_path / 'sweep'}"]) == 0
+    assert report.main([f"run={tmp_path / 'sweep'}"]) == 0
     assert Page(tmp_path / "sweep/report.html").heads[0] == "2 runs"
 
 
 def test_comparison_is_a_plot_and_its_numbers(here, capsys):
-    assert compare.COMMAND.main(["run=a,b,c", "metric=loss/entropy", "file=plot.svg"]) == 0
+    assert compare.main(["run=a,b,c", "metric=loss/entropy", "file=plot.svg"]) == 0
     assert "IQM of loss/entropy" in capsys.readouterr().out
     assert (here / "plot.svg").read_text().startswith("<?xml")
     with open(here / "plot.csv", newline="") as file:
@@ -148,7 +148,7 @@ def test_comparison_of_evaluations_with_words_of_ones_own(here):
     for name in "ac":
         assert evaluate.main([f"run={name}", "episodes=8", "device=cpu"]) == 0
     words = ["run=a,c", "metric=eval/length", "file=own.svg", "labels=[$_one_$,two]", "legend=none"]
-    assert compare.COMMAND.main([*words, "title=Who lasts?", "xlabel=steps", "ylabel=length"]) == 0
+    assert compare.main([*words, "title=Who lasts?", "xlabel=steps", "ylabel=length"]) == 0
     plot = (here / "own.svg").read_text()
     assert all(f"<!-- {text} -->" in plot for text in ("Who lasts?", "steps", "length"))
     assert "two (1)" not in plot, "no legend"
@@ -158,14 +158,14 @@ def test_comparison_of_evaluations_with_words_of_ones_own(here):
         (table,) = map(json.loads, (f.read_text() for f in (here / run).glob("evaluations/*.json")))
         point = float(row["samples"]), float(row["mean"])
         assert (row["runs"], *point) == (name, table["step"], table["rows"][0]["length"])
-    assert compare.COMMAND.main(["run=a,c", "labels=[one]", "file=own.svg"]) == 2
+    assert compare.main(["run=a,c", "labels=[one]", "file=own.svg"]) == 2
 
 
 def test_long_words_of_a_comparison_are_not_cut_off(here):
     """Nothing is drawn at the edges of the plot; the minus signs of its numbers are in it."""
     long = "words_that_are_long " * 8
     words = [f"title={long}", f"xlabel={long}", f"ylabel={long}", f"labels=[{long},two]"]
-    assert compare.COMMAND.main(["run=a,c", "metric=loss/policy", "file=long.png", *words]) == 0
+    assert compare.main(["run=a,c", "metric=loss/policy", "file=long.png", *words]) == 0
     pixels = np.asarray(Image.open(here / "long.png").convert("L"))
     assert all((edge == 255).all() for edge in (pixels[:3], pixels[-3:], pixels[:, :3].T))
     assert (pixels[:, -3:] == 255).all() and (pixels < 128).any()
@@ -191,7 +191,7 @@ def test_page_of_a_resumed_run_names_the_command_that_made_it(here, tmp_path):
     row = {"samples": 512, "command": "train.py resume=e more_samples=88"}
     with open(run / "provenance.jsonl", "a") as file:
         file.write(json.dumps(row) + "\n")
-    assert report.COMMAND.main([f"run={run}"]) == 0
+    assert report.main([f"run={run}"]) == 0
     facts = {row[0]: row[1] for row in Page(run / "report.html").rows if len(row) == 2}
     assert facts["command"] == "train.py env=explorer geometry.n=4"
     assert facts["resumed"] == "1 times, last after 512 samples"
@@ -225,7 +225,7 @@ def test_runs_that_share_no_metric(here, tmp_path, capsys):
     shutil.rmtree(odd / "evaluations", ignore_errors=True)  # of other tests
     (odd / "metrics.jsonl").write_text('{"samples": 1, "x": 1.0}\n')
     words = f"run=[{here / 'a'},{odd}]", f"file={tmp_path / 'plot.pdf'}"
-    assert compare.COMMAND.main([*words]) == 2
+    assert compare.main([*words]) == 2
     assert "share no metric, so they cannot be compared" in capsys.readouterr().err
     assert not [*tmp_path.glob("plot*")]
 
@@ -241,7 +241,7 @@ def test_training_can_end_with_a_report(tmp_path, monkeypatch, capsys):
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 @pytest.mark.parametrize("words", [["run=e"], ["run=[a,b,c]"]])
 def test_a_browser_draws_every_chart(here, words):
-    assert report.COMMAND.main([*words, "file=page.html"]) == 0
+    assert report.main([*words, "file=page.html"]) == 0
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=5000"]
     page = f"file://{here / 'page.html'}"
     result = subprocess.run([CHROMIUM, *flags, "--dump-dom", page], capture_output=True, text=True)

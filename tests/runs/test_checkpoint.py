@@ -402,7 +402,7 @@ def test_reader_never_meets_a_checkpoint_that_is_being_deleted(tmp_path, writer,
 
 
 def test_inspect_of_a_run_that_is_training(tmp_path, writer, between_steps, capsys):
-    results = [*between_steps(lambda: inspect.COMMAND.main([str(tmp_path)]), writer, ("open",))]
+    results = [*between_steps(lambda: inspect.main([str(tmp_path)]), writer, ("open",))]
     text = capsys.readouterr().out
     assert len(results) > 5 and not any(results) and "damaged" not in text
     assert text.count("intact") > len(results)

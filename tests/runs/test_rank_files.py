@@ -57,7 +57,7 @@ def test_checkpoint_holds_the_state_of_every_rank(folder, capsys):
     assert second.state["env"]["x"].tolist() == second.state["replay"]["rows"].tolist() == [1, 1]
     assert second.state["policy"]["w"].tolist() == [0, 0, 0]
     assert third.state["samples"] == 8 and "env" not in third.state  # it has no file
-    assert inspect.COMMAND.main([str(folder / "step_16")]) == 0
+    assert inspect.main([str(folder / "step_16")]) == 0
     assert "rank1.pt" in capsys.readouterr().out
     assert {*checkpoint.load_latest(folder, is_whole=False).state} == {
         *("samples", "policy", "learner")
