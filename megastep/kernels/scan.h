@@ -1,5 +1,5 @@
-// Ranges of a lidar: the nearest wall along each ray, a thread per ray. Ray 0 looks ahead, the others
-// follow counter-clockwise.
+// Ranges of a lidar: the nearest wall along each ray, a thread per ray. Ray 0 looks ahead, the
+// others follow counter-clockwise.
 #pragma once
 #include "common/math.h"
 #include "params.h"
