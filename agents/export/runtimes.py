@@ -31,7 +31,7 @@ from megastep.agents.runs import folders, restore
 from megastep.arrdict import arrdict
 from megastep.atomic_files import write_atomically
 from megastep.dotdict import leaves, mapping
-from megastep.types import Env, Tree, World, n_lanes
+from megastep.types import Env, Tree, World, n_lanes, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
@@ -170,6 +170,9 @@ def write(run: Path, path: Path) -> str:
     with user_errors(f"{path} cannot be written: ", (OSError,)):
         path.parent.mkdir(parents=True, exist_ok=True)
         save(step, path, folders.name_of(run))
+        if path.suffix == ".onnx":
+            text = json.dumps(description(step, env), indent=1)
+            write_atomically(path.with_suffix(".json"), text.encode())
     difference = compare(step, runner(path), policy, env, path)
     inputs, outputs = (
         ", ".join(port.name for port in side) for side in (step.inputs, step.outputs)
@@ -178,6 +181,20 @@ def write(run: Path, path: Path) -> str:
         f"{inputs} -> {outputs}; in 1,000 steps its numbers differ from the policy's by at most "
         f"{difference:.1g}"
     )
+
+
+def description(step: Step, env: Env) -> dict:
+    """Returns what a program beside a policy's file must know: steps per second, names and shapes,
+    bounds of continuous actions, and what the environment's ``describe()`` says, if it has one.
+    """
+    sides = json.loads(step.ports)
+    for port in sides["outputs"]:
+        path = port["name"].partition(".")[2]
+        space = spaces.leaves(env.action_space).get(path)
+        if port["name"].startswith("action") and isinstance(space, spaces.MultiContinuous):
+            port.update(low=space.low, high=space.high)
+    about = getattr(env, "describe", dict)()
+    return {"steps_per_second": optional(env, "fps"), **sides, **about}
 
 
 def save(step: Step, path: Path, name: str = "the policy") -> None:

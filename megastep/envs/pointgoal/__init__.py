@@ -1,5 +1,6 @@
 """PointGoal: navigate to a point given by its distance and bearing."""
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -159,6 +160,29 @@ class PointGoal(FirstPerson):
         """As of :class:`FirstPerson`; the target is the goal."""
         goals = self.goals.points[self.layout.long(), self.goal_index.long()]
         return self._with_target(super().truth(), goals)
+
+    def describe(self) -> dict:
+        """Returns what the numbers of a robot's observations and actions mean, for programs that
+        drive one with an exported policy. Empty without a robot.
+        """
+        if self.robot is None:
+            return {}
+        robot, limits = dataclasses.asdict(self.robot), [self.robot.speed, self.robot.turn_rate]
+        sensors = {
+            "goal": ["distance / 10 m", "cosine of the bearing", "sine of the bearing"],
+            "odom": [f"speed ahead / {limits[0]:g} m/s", f"turning left / {limits[1]:g} rad/s"],
+        }
+        if self.robot.sensor == "lidar":
+            sensors["scan"] = {
+                "value": "1 - clip(range / range_max, 0, 1); 0 also without a return",
+                "n_rays": self.robot.n_rays,
+                "angle_min": 0.0,  # rad, ahead, then counter-clockwise
+                "angle_increment": 2 * math.pi / self.robot.n_rays,
+                "range_min": self.robot.range_min,  # m
+                "range_max": self.robot.range_max,
+            }
+        action = {"names": ["linear.x", "angular.z"], "units": ["m/s", "rad/s"], "high": limits}
+        return {"robot": robot, "observations": sensors, "actions": action, "reach": REACH}
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""
