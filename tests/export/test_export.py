@@ -1,6 +1,7 @@
 """A policy as a file of another runtime acts as it does in megastep."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -136,6 +137,9 @@ def test_an_agent_of_gymnasium_is_exported(here):
     session = onnxruntime.InferenceSession("a.onnx")
     inputs = {port.name: port.shape[1:] for port in session.get_inputs()}
     assert inputs == {"obs": [1, 8], "reset": [], "state.0": [8], "state.1": [8]}
+    about = json.loads(Path("a.json").read_text())
+    assert {port["name"]: port["shape"] for port in about["inputs"]} == inputs
+    assert about["steps_per_second"] == 50 and "robot" not in about
 
 
 class Odd(torch.nn.Module):

@@ -82,7 +82,7 @@ class FollowPath:
 
     def begin(self, episode):
         path = self.plan(episode)
-        self.path = episode.goal[None] if path is None else path
+        self.path = episode.goal[None] if path is None else dense(path)
         self.at = 0
 
     def act(self, ranges, twist, pose, goal):
@@ -99,3 +99,10 @@ def pursue(robot, heading, distance):
     turn = np.clip(2.5 * heading, -robot["turn_rate"], robot["turn_rate"])
     speed = robot["speed"] * max(0.0, math.cos(heading)) ** 3
     return np.array([min(speed, 1.5 * distance), turn])
+
+
+def dense(path, gap=0.05):
+    """Returns a path with a point every few centimetres."""
+    counts = [max(int(np.hypot(*(b - a)) / gap), 1) for a, b in zip(path, path[1:])]
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(path, path[1:], counts)]
+    return np.concatenate([*pieces, path[-1:]])

@@ -1,9 +1,10 @@
 """Writes episodes of PointGoal for any simulator: walls, starts, goals, shortest paths.
 
     python episodes.py homes homes.npz --n-homes 200 --n 1000
-    python episodes.py maps.npz maps.npz           # geometries of `megastep import`, or any file
+    python episodes.py houseexpo maps.npz --split all    # after `megastep import`
+    python episodes.py home.npz maps.npz                 # or any file of geometries
 
-Homes are of the test split, starts and goals those that the environment itself draws. A file holds
+Homes are of the test split by default, starts and goals are drawn as in training. A file has
 `walls` (W, 2, 2) of all homes, `first_wall` (D + 1,), `names` (D,), and per episode `home`, `start`
 (x, y, radians), `goal` (x, y) and `shortest`, in metres.
 """
@@ -27,15 +28,18 @@ class Episode(NamedTuple):
     shortest: float  # metres
 
 
-def write(source: str, path: str, n: int, n_homes: int, seed: int, robot: dict) -> None:
+def write(
+    source: str, path: str, n: int, n_homes: int, seed: int, robot: dict, split: str = "test"
+) -> None:
     """Writes n episodes in homes of a source (homes, mazes ...) or of a file of geometries."""
     from megastep import envs, geometries, modules  # noqa: I001
     import torch
 
     if source.endswith(".npz"):
-        homes = geometries.files(n_homes, path=source, split="all")
+        homes = geometries.sample("files", 1000, split="all", path=source)
+        homes = [*{id(home): home for home in homes}.values()][:n_homes]
     else:
-        homes = geometries.sample(source, n_homes, split="test", seed=seed)
+        homes = geometries.sample(source, n_homes, split=split, seed=seed)
     env = envs.PointGoal(
         n, homes, robot=modules.Robot(**robot), resample=True, seed=seed, device="cpu"
     )
@@ -79,11 +83,13 @@ if __name__ == "__main__":
     parser.add_argument("--n", type=int, default=1000)
     parser.add_argument("--n-homes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--split", default="test", choices=["training", "test", "all"])
     parser.add_argument("--radius", type=float, default=0.17)
     words = parser.parse_args()
     try:
         robot = dict(radius=words.radius)
-        write(words.source, words.file, words.n, words.n_homes, words.seed, robot)
+        how = words.n, words.n_homes, words.seed, robot, words.split
+        write(words.source, words.file, *how)
     except ValueError as error:  # no goal can be reached, a robot that fits through no door
         print(f"episodes.py: {error}", file=sys.stderr)
         sys.exit(2)

@@ -136,15 +136,8 @@ def plan(episode, radius, cell=0.1):
                 episode.start[:2, None], episode.goal[:, None], show_animation=False
             )
         if path is not None and np.size(path):
-            return _dense(np.append(np.asarray(path, float).T[::-1][:-1], episode.goal[None], 0))
+            return np.append(np.asarray(path, float).T[::-1][:-1], episode.goal[None], 0)
     return None
-
-
-def _dense(path, gap=0.05):
-    """Returns a path with a point every few centimetres."""
-    counts = [max(int(np.hypot(*(b - a)) / gap), 1) for a, b in zip(path, path[1:])]
-    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(path, path[1:], counts)]
-    return np.concatenate([*pieces, path[-1:]])
 
 
 def _plain(tree):

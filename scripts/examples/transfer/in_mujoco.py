@@ -12,7 +12,10 @@ HEIGHT = 0.2  # of the lidar above the axle
 MODEL = """
 <mujoco>
   <option timestep="0.004" integrator="implicitfast"/>
-  <visual><global offwidth="{width}" offheight="{height}"/></visual>
+  <visual>
+    <global offwidth="640" offheight="640"/>
+    <headlight ambient=".45 .45 .45" diffuse=".4 .4 .4"/>
+  </visual>
   <asset>
     <texture type="skybox" builtin="gradient" rgb1=".8 .85 .9" rgb2="1 1 1" width="64" height="64"/>
   </asset>
@@ -80,7 +83,7 @@ class InMujoco:
             **dict(walls="\n".join(walls), x=x, y=y, angle=math.degrees(angle), lidar=HEIGHT),
             **dict(sites="\n".join(rays), wheel=WHEEL, half=TRACK / 2, radius=robot["radius"]),
             sensors="".join(f'<rangefinder site="ray{k}"/>' for k in range(n)),
-            **dict(middle=f"{mx} {my}", width=640, height=640),
+            middle=f"{mx} {my}",
             fovy=math.degrees(2 * math.atan(math.tan(FOV / 2) * 8 / PIXELS)),
         )
         self.model = mujoco.MjModel.from_xml_string(text)
