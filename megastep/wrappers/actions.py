@@ -91,22 +91,27 @@ class NoisyActions(_Random):
     ):
         super().__init__(env)
         self.probability, self.std = probability, std
-        leaves = spaces.leaves(env.action_space).values()
+        leaves = [*spaces.leaves(env.action_space).values()]
+        #: Bounds of continuous actions, made once: a step copies nothing to the device.
+        self.bounds = [
+            space.tensors(env.device) if isinstance(space, spaces.MultiContinuous) else ()
+            for space in leaves
+        ]
         self.draws = [Draws(env, space.shape, seed + (i << 40)) for i, space in enumerate(leaves)]
         self.levels = Levels(env, per_episode, seed)
 
     def before(self, actions: Tree) -> Tree:
         """Returns the actions with noise."""
-        draws, levels = iter(self.draws), self.levels.values
+        draws, levels, all_bounds = iter(self.draws), self.levels.values, iter(self.bounds)
 
         def disturb(space, leaf) -> torch.Tensor:
-            numbers = next(draws)()
+            numbers, bounds = next(draws)(), next(all_bounds)
             if isinstance(space, spaces.MultiDiscrete):
                 n = space.n_actions
                 others = (numbers[..., 1] * n).to(leaf.dtype).clamp(max=n - 1)
                 is_random = numbers[..., 0] < along(self.probability * levels, leaf)
                 return torch.where(is_random, others, leaf)
-            low, high = space.tensors(leaf.device)
+            low, high = bounds
             noise = along(self.std * levels, leaf) * ((high - low) * 0.5) * normal(numbers)
             return torch.minimum(torch.maximum(leaf + noise, low), high)
 

@@ -4,11 +4,14 @@ import copy
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from megastep import contract, engine, envs, modules, spaces, toys
 from megastep.agents.cli import train
+from megastep.agents.factory import make, settings
 from megastep.arrdict import arrdict
 from megastep.capture import Captured
+from megastep.geometries import sample
 from megastep.modules import Robot
 from megastep.wrappers import (
     WRAPPERS,
@@ -23,8 +26,9 @@ from megastep.wrappers import (
     ShapeReward,
     StickyActions,
     TimeLimit,
+    Wrapper,
 )
-from tests.helpers import pages
+from tests.helpers import pages, tiny
 from tests.helpers.tiny import TINY
 
 B = 64
@@ -353,3 +357,29 @@ def test_code_and_commands_of_the_page_work(here, monkeypatch):
             taken = arrdict(actions=torch.full((4, 1), action))
             difference = plain.step(taken).reward - paid.step(taken).reward
             torch.testing.assert_close(difference, torch.full((4,), cost))
+
+
+class NoCopies(TorchDispatchMode):
+    """Raises where a tensor is made of Python's numbers: on a GPU, a copy to the device, which a
+    CUDA graph cannot hold.
+    """
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        assert function is not torch.ops.aten.lift_fresh.default
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("words", [[], ["env.slide=true"], ["env.robot.sensor=rgb"]])
+def test_a_step_of_the_robots_recipe_copies_nothing_to_the_device(words):
+    """With all of its wrappers."""
+    wrapped = tiny.settings("experiment=robot", "geometry.n=2", "env.n_envs=4", *words).env
+    if words[-1:] == ["env.robot.sensor=rgb"]:
+        wrapped = settings.changed(wrapped, wrappers=wrapped.wrappers[:3])
+    env = make.make_sample(wrapped, sample("homes", 2), seed=1, device="cpu")
+    assert isinstance(env, Wrapper)
+    world = env.reset()
+    decision = arrdict(actions=contract.random_actions(env, torch.Generator().manual_seed(1)))
+    for _ in range(3):
+        with NoCopies():
+            world = env.step(decision)
+    assert world.obs.goal.isfinite().all()
