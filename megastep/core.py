@@ -75,7 +75,7 @@ class Core:
         scenery = engine.Scenery(self.n_agents, shared.layouts, shared.model, widths, layout)
         if shared.objects is not None:
             objects = copy.copy(shared.objects)
-            own = {name: getattr(objects, name)[[e]] for name in ("records", "lines", "texels")}
+            own = {name: getattr(objects, name)[[e]] for name in ("records", "lines", "texels", "bodies")}
             vars(objects).update(own, n_envs=1)
             scenery.objects = objects
         yaws = self.agents.yaws.tolist()
@@ -119,6 +119,7 @@ class Core:
                 positions=objects.positions[0][there],
                 angles=objects.angles[0][there],
                 sizes=objects.sizes[0][there],
+                widths=objects.widths[there],
                 colours=objects.palette[objects.colours[0][there].long()],
             )
         return state
@@ -152,7 +153,8 @@ class Core:
         )
         for k, shape in enumerate(objects.shapes):
             pose = objects.positions[k], objects.angles[k], objects.sizes[k]
-            plotting.plot_object(area, names[int(shape)], *pose, gamma_encode(objects.colours[k]))
+            colour, width = gamma_encode(objects.colours[k]), float(objects.widths[k])
+            plotting.plot_object(area, names[int(shape)], *pose, colour, width)
         n_agents, n_cameras = len(state.positions), len(state.yaws)
         for a, (position, angle) in enumerate(zip(state.positions, state.angles, strict=True)):
             colour = plotting.AGENTS[a % len(plotting.AGENTS)]

@@ -72,9 +72,11 @@ def object_params(scenery: Scenery) -> bytes:
     o = scenery.objects
     if o is None:
         return _NO_OBJECTS
-    key, packed = (_address(o.records), _address(o.palette)), vars(o).get("_packed")
+    key = _address(o.records), _address(o.palette), _address(o.bodies)
+    packed = vars(o).get("_packed")
     if packed is None or packed.key != key:
         same = "shapes", "line_starts", "line_object", "palette", "lines", "texels", "ends"
+        same += "bodies", "body_objects", "object_bodies", "n_bodies"
         struct = ENGINE.params.ObjectsParams(
             **{name: getattr(o, name) for name in (*same, "n_objects", "n_colours")},
             extents=scenery.layouts.extents,

@@ -30,6 +30,7 @@ UNSPILLED_BLOCKS = 18
 APART = 0.05  # metres
 #: Of baked light in the cache: the beginning of files' names, their number, and the fewest layouts.
 PREFIX, MAX_FILES, MIN_CACHED = "baked-light-", 16, 32
+MAX_SLOTS = ENGINE.constants["MAX_SLOTS"]  # agents and movable objects of an environment
 
 
 def bake(scenery: Scenery) -> None:
@@ -88,6 +89,9 @@ def physics(
     """Moves the agents by their velocities for 1 / fps seconds, in place. An agent stops just
     before the first wall, agent or solid object that it touches, and its velocities become 0.
 
+    With movable objects, agents push these and slide along what they touch. Their velocity follows
+    what actions ask for as fast as ``objects.force`` allows; those of objects change in place too.
+
     Args:
         actions: (N, A) int64, or (N, A, n_moves) float32. If given, velocities are first multiplied
             by ``1 - damping``. An integer then adds one row of ``moves``. Floats, clipped to
@@ -116,9 +120,19 @@ def physics(
     kernel = kernel if is_many else f"{kernel}_unspilled"
     room = n_resident_threads(device, UNSPILLED_BLOCKS)
     threads_per_env = next((size for size in GROUPS if size * n <= room), GROUPS[-1])
+    shape, of_bodies = threads_per_env * n, {}
+    if scenery.objects is not None and scenery.objects.n_bodies:
+        if a + scenery.objects.n_bodies > MAX_SLOTS:
+            raise ValueError(
+                f"an environment has at most {MAX_SLOTS} agents and movable objects together, but "
+                f"there are {a} and {scenery.objects.n_bodies}"
+            )
+        kernel, shape = "physics_bodies", WARP * n
+        of_bodies = dict(force=scenery.objects.force, grip=scenery.objects.grip)
     launch(
-        *(ENGINE, kernel, device, threads_per_env * n),
+        *(ENGINE, kernel, device, shape),
         **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        **of_bodies,
         progress=progress,
         actions=actions_at,
         controls=controls_at,

@@ -36,6 +36,11 @@ struct PhysicsParams : WorldParams {
     ObjectsParams objects;
 };
 
+struct PhysicsBodiesParams : PhysicsParams {
+    float force;  // newtons, at most, of each agent
+    float grip;   // newtons, at most, between an agent and what it holds
+};
+
 struct UpdateAgentGeometryParams : WorldParams {
     int lit;  // 1: light the agents' texels too
 };

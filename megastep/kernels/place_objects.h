@@ -7,7 +7,8 @@
 // that are there and are not to be placed after it.
 HD int fits(const PlaceObjectsParams& p, int env, int i, float x, float y) {
     const ObjectsParams& o = p.objects;
-    float size = objects_of(o)[i].size, apart = p.scenery.radius + size + p.apart;
+    float size = radius_of(o, i % o.n_objects, objects_of(o)[i].size);
+    float apart = p.scenery.radius + size + p.apart;
     for (int a = env * p.scenery.n_agents; a < (env + 1) * p.scenery.n_agents; a++) {
         float dx = x - p.positions[2 * a], dy = y - p.positions[2 * a + 1];
         if (dx * dx + dy * dy < apart * apart)
@@ -18,11 +19,21 @@ HD int fits(const PlaceObjectsParams& p, int env, int i, float x, float y) {
         if ((p.mask[k] && k >= i) || !other.visible || (!p.mask[k] && other.carrier >= 0))
             continue;
         float dx = x - other.x, dy = y - other.y;
-        apart = other.size + size + p.apart;
+        apart = radius_of(o, k % o.n_objects, other.size) + size + p.apart;
         if (dx * dx + dy * dy < apart * apart)
             return 0;
     }
     return 1;
+}
+
+// Stops a body that is put elsewhere, and frees it.
+HD void rest(Body& body) {
+    body.vx = 0.f;
+    body.vy = 0.f;
+    body.turning = 0.f;
+    body.holder = -1;
+    body.owner = -1;
+    body.locked = 0;
 }
 
 // Places the masked objects of an environment one after the other, each at the first point that
@@ -54,6 +65,9 @@ HD void place_objects_of(const PlaceObjectsParams& p, int env) {
         object.angle = 360.f * unit_float(bits.b) - 180.f;
         object.carrier = -1;
         object.visible = 1;
+        int body = o.n_bodies ? o.object_bodies[i % o.n_objects] : -1;
+        if (body >= 0)
+            rest(bodies_of(o)[env * o.n_bodies + body]);
     }
 }
 

@@ -1,18 +1,7 @@
 // One thread per environment; where points are to be hidden one warp, each lane of which tests one
 // wall at a time.
 #include "spawn.h"
-
-// The threads of a warp as a group that works on one environment, see common/line_of_sight.h.
-struct WholeWarp {
-    static constexpr int SIZE = WARP;
-    int rank;
-};
-
-DEVICE void sync(const WholeWarp&) { __syncwarp(); }
-
-DEVICE unsigned int reduce_or(const WholeWarp&, unsigned int bits) {
-    return __reduce_or_sync(FULL_WARP, bits);
-}
+#include "warp_cuda.h"
 
 template <int hidden, int with_objects>
 DEVICE void spawn_in(const SpawnParams& p) {

@@ -80,11 +80,14 @@ HD int clear_point(const SpawnParams& p, int env, int a, int layout, int first) 
     return first;
 }
 
-// Has agent a drop what it carries, where it is.
+// Has agent a drop what it carries, where it is, and let go of what it holds.
 HD void drop_all(const ObjectsParams& o, int env, int a) {
     for (int i = env * o.n_objects; i < (env + 1) * o.n_objects; i++)
         if (objects_of(o)[i].carrier == a)
             objects_of(o)[i].carrier = -1;
+    for (int i = env * o.n_bodies; i < (env + 1) * o.n_bodies; i++)
+        if (bodies_of(o)[i].holder == a)
+            bodies_of(o)[i].holder = -1;
 }
 
 // Respawns the masked agents of an environment: at rest, with a random heading, at a random point

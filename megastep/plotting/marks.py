@@ -124,10 +124,16 @@ def plot_shot(ax: Area | Axes, start: ArrayLike, end: ArrayLike, colour: str) ->
 
 
 def plot_object(
-    ax: Area | Axes, shape: str, position: ArrayLike, angle: float, size: float, colour: ArrayLike
+    ax: Area | Axes,
+    shape: str,
+    position: ArrayLike,
+    angle: float,
+    size: float,
+    colour: ArrayLike,
+    width: float = 1.0,
 ) -> None:
     """Draws a disc, a crate or a door, as :class:`megastep.engine.Objects` has them; the colour
-    is (3,), sRGB.
+    is (3,), sRGB. A crate's width is a fraction of its length.
     """
     area, position = Area.on(ax), np.asarray(position, float)
     fill, edge = tuple(np.asarray(colour, float)), area.style.colours.text
@@ -136,6 +142,7 @@ def plot_object(
     if shape == "disc":
         area.disc(position, size, OBJECTS, fill=fill, edge=edge, width=0.7, least=3)
     elif shape == "crate":
+        aside = width * aside
         corners = [ahead + aside, aside - ahead, -ahead - aside, ahead - aside]
         area.polygon(position + np.array(corners), OBJECTS, fill=fill, edge=edge, width=0.7)
     else:

@@ -26,3 +26,6 @@ constexpr int DISC = 0;
 constexpr int CRATE = 1;
 constexpr int DOOR = 2;
 constexpr int OBJECT_BYTES = 32;  // of a record
+constexpr int BODY_BYTES = 48;
+constexpr int MAX_BODIES = 16;  // objects of an environment that can be pushed
+constexpr int MAX_SLOTS = 32;   // with its agents

@@ -20,6 +20,22 @@ struct ALIGNED Object {
 };
 static_assert(sizeof(Object) == OBJECT_BYTES, "Python views its fields");
 
+// What an object has that can be pushed, in 48 bytes.
+struct ALIGNED Body {
+    float vx, vy;                     // m/s
+    float turning;                    // deg/s
+    float mass;                       // kg
+    float friction;                   // coefficient, with the floor
+    int holder;                       // the agent that holds it; -1: none
+    float hold_x, hold_y, hold_turn;  // its pose in the holder's frame
+    int owner;                        // the team that locked it; -1: none
+    unsigned char movable;            // 0: as if its mass were infinite
+    unsigned char locked;             // 1: likewise
+    unsigned char grabbed;            // 1: since the last step, so its pose is to be stored
+    unsigned char unused[5];
+};
+static_assert(sizeof(Body) == BODY_BYTES, "Python views its fields");
+
 struct ObjectsParams {
     const int* shapes;       // (O) DISC, CRATE or DOOR
     const int* line_starts;  // (O + 1) first line of each object
@@ -32,11 +48,25 @@ struct ObjectsParams {
     int n_objects;           // 0: there are none
     int n_lines;
     int n_colours;
-    int lit;            // 1: the layout's lights fall on them, else each has full light
-    const float* ends;  // (L, 4) of each line, of an object of size 1 at the origin
+    int lit;                   // 1: the layout's lights fall on them, else each has full light
+    const float* ends;         // (L, 4) of each line, of an object of size 1 at the origin
+    float* bodies;             // (N, B) records of the struct Body
+    const int* body_objects;   // (B) the object that each body is
+    const int* object_bodies;  // (O) the body that each object is; -1: none
+    int n_bodies;              // B
 };
 
 HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
+
+HD Body* bodies_of(const ObjectsParams& o) { return (Body*)o.bodies; }
+
+// Half the diagonal of object k, if it is a body, since bodies never overlap; else its size.
+HD float radius_of(const ObjectsParams& o, int k, float size) {
+    if (o.n_bodies == 0 || o.object_bodies[k] < 0 || o.shapes[k] == DISC)
+        return size;
+    float half = LOAD((const Float4*)o.ends + o.line_starts[k]).y;
+    return size * SQRT(1.f + half * half);
+}
 
 // The object of an environment's line l; the first if its number is of none.
 HD int object_of(const ObjectsParams& o, int l) {
@@ -81,7 +111,8 @@ HD Float4 line_of(const ObjectsParams& o, int l, const Object& object, const Pos
 HD int is_clear(const ObjectsParams& o, int env, float x, float y, float radius) {
     for (int i = env * o.n_objects; i < (env + 1) * o.n_objects; i++) {
         Object object = objects_of(o)[i];
-        float dx = x - object.x, dy = y - object.y, apart = radius + object.size;
+        float apart = radius + radius_of(o, i % o.n_objects, object.size);
+        float dx = x - object.x, dy = y - object.y;
         if (is_obstacle(object) && dx * dx + dy * dy < apart * apart)
             return 0;
     }

@@ -1,0 +1,703 @@
+// How agents and objects move that push each other. A step is divided into substeps, as in Box2D
+// 3's "soft step". Each finds where hulls touch, changes velocities by impulses until nothing comes
+// closer there than it may, moves everything, and shifts apart what overlaps nonetheless.
+//
+// Agents are discs of 1 kg, driven towards the velocity that their actions ask for. Bodies are
+// objects that can be pushed. Both have a slot, the agents first. Touches are solved in the order
+// of their slots, and of walls and other objects behind them; threads of a group take those that
+// share no slot at the same time, which gives the same bits.
+//
+// See https://box2d.org/posts/2024/02/solver2d/ for solvers of this kind.
+#pragma once
+#include "common/line_of_sight.h"
+#include "draw_objects.h"
+#include "hulls.h"
+#include "physics.h"
+
+constexpr int MAX_CANDIDATES = 128;  // pairs of hulls that may touch in a step
+constexpr int MAX_TOUCHES = 64;      // that do in a substep
+constexpr int SUBSTEPS = 4;
+constexpr int ITERATIONS = 3;
+constexpr float SLOP = 0.002f;         // metres of overlap that are left alone
+constexpr float MAX_OVERLAP = 0.005f;  // metres; a substep that would lead to more is taken back
+constexpr float MAX_SHIFT = 0.02f;     // metres by which overlaps shrink in a substep
+constexpr float LIGHT = 100.f;  // how much more agents give way to bodies in shifts than by mass
+constexpr float MAX_STRETCH = 0.25f;  // metres that an agent and what it holds are out of place
+constexpr float MIN_LIMIT = 0.2f;     // m/s that any slot may have beyond the fastest at the start
+constexpr float AGENT_MASS = 1.f;     // kg
+constexpr float GRAVITY = 9.81f;      // m/s2
+constexpr float ARM = 0.93f;  // of friction with the floor, per radius of gyration: within 7 %
+constexpr float RADIANS = 0.017453292519943295f;
+constexpr float DEGREES = 57.29577951308232f;
+
+// What a candidate's second hull is.
+constexpr int SLOT = 0;
+constexpr int WALL = 1;
+constexpr int OBJECT = 2;
+
+// Motions of all slots.
+struct Motion {
+    float x[MAX_SLOTS], y[MAX_SLOTS], turn[MAX_SLOTS];
+};
+
+// One environment in a step: a column per slot, candidate, and touch. Of a body that cannot move,
+// the inverse mass is 0.
+struct Bodies {
+    Hull hulls[MAX_SLOTS], before[MAX_SLOTS];  // now, and before the substep
+    float angles[MAX_SLOTS], angles_before[MAX_SLOTS];
+    Motion velocity, shift;                      // m/s and rad/s; metres and radians
+    float wish_x[MAX_SLOTS], wish_y[MAX_SLOTS];  // m/s, of agents
+    float inv_mass[MAX_SLOTS], inv_inertia[MAX_SLOTS];
+    float drag[MAX_SLOTS];  // newtons, at most, of friction with the floor
+    float drag_x[MAX_SLOTS], drag_y[MAX_SLOTS], drag_turn[MAX_SLOTS];  // impulses in this substep
+    float hold_x[MAX_BODIES], hold_y[MAX_BODIES], hold_turn[MAX_BODIES];
+    float hold[MAX_BODIES][3];                      // impulse and torque in this substep
+    float load[MAX_BODIES], load_turn[MAX_BODIES];  // their sums over all substeps
+    float extent[MAX_SLOTS], speeds[MAX_SLOTS];
+    int exists[MAX_SLOTS], holders[MAX_SLOTS], hit[MAX_SLOTS];
+    int overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
+    int candidates[MAX_CANDIDATES];
+    int touch_a[MAX_TOUCHES], touch_b[MAX_TOUCHES], levels[MAX_TOUCHES];
+    Touch touches[MAX_TOUCHES];
+    float impulses[MAX_TOUCHES][2];
+    int last[MAX_SLOTS], n_levels;
+};
+
+HD int n_slots_of(const PhysicsBodiesParams& p) { return p.scenery.n_agents + p.objects.n_bodies; }
+
+HD void turn_hull(Hull& hull, float degrees) { sincos_degrees(degrees, hull.sine, hull.cosine); }
+
+// Fills in an agent's slot. Its disc is larger than the one that no wall may enter, by what may
+// overlap. Its velocity is the real one; its action changes what it wishes.
+HD void begin_agent(const PhysicsBodiesParams& p, Bodies& b, int env, int a) {
+    int i = env * p.scenery.n_agents + a;
+    b.hulls[a] = {p.positions[2 * i],
+                  p.positions[2 * i + 1],
+                  0.f,
+                  1.f,
+                  p.scenery.radius * INFLATION + MAX_OVERLAP,
+                  -1.f};
+    b.angles[a] = p.angles[i];
+    b.velocity.x[a] = p.velocity[2 * i];
+    b.velocity.y[a] = p.velocity[2 * i + 1];
+    turn_hull(b.hulls[a], b.angles[a]);
+    if (p.actions)
+        apply_action(p, env, i);
+    if (p.controls)
+        apply_controls(p, env, i);
+    b.wish_x[a] = p.velocity[2 * i];
+    b.wish_y[a] = p.velocity[2 * i + 1];
+    b.velocity.turn[a] = p.angvelocity[i] * RADIANS;
+    b.inv_mass[a] = 1.f / AGENT_MASS;
+    b.inv_inertia[a] = 0.f;  // nothing but its action turns it
+    b.drag[a] = 0.f;
+    b.exists[a] = 1;
+    b.holders[a] = -1;
+    b.extent[a] = b.hulls[a].hx;
+}
+
+// Fills in the slot of a body, whose object is at rest if it is not to move.
+HD void begin_body(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
+    const ObjectsParams& o = p.objects;
+    int slot = p.scenery.n_agents + k, object_index = o.body_objects[k];
+    Object object = objects_of(o)[env * o.n_objects + object_index];
+    Body body = bodies_of(o)[env * o.n_bodies + k];
+    float hy = half_width_of(o, object_index, object.size);
+    b.hulls[slot] = {object.x, object.y, 0.f, 1.f, object.size, hy};
+    b.angles[slot] = object.angle;
+    turn_hull(b.hulls[slot], object.angle);
+    b.exists[slot] = is_obstacle(object) && is_drawn(object);
+    b.extent[slot] = extent_of(object.size, hy);
+    int moves =
+        b.exists[slot] && body.movable && !body.locked && body.mass > 0.f && is_finite(body.mass);
+    float gyration2 = hy < 0.f ? 0.5f * object.size * object.size
+                               : (object.size * object.size + hy * hy) * (1.f / 3.f);
+    b.inv_mass[slot] = moves ? 1.f / body.mass : 0.f;
+    b.inv_inertia[slot] = moves ? 1.f / (body.mass * gyration2) : 0.f;
+    b.velocity.x[slot] = moves ? body.vx : 0.f;
+    b.velocity.y[slot] = moves ? body.vy : 0.f;
+    b.velocity.turn[slot] = moves ? body.turning * RADIANS : 0.f;
+    b.drag[slot] = body.friction * body.mass * GRAVITY;
+    b.load[k] = 0.f;
+    b.load_turn[k] = 0.f;
+    b.hold_x[k] = body.hold_x;
+    b.hold_y[k] = body.hold_y;
+    b.hold_turn[k] = body.hold_turn;
+    b.holders[slot] = moves && is_agent(body.holder, p.scenery.n_agents) ? body.holder : -1;
+}
+
+// Stores where a body is in its holder's frame if it was just grabbed. Else has the holder let go
+// if one of the two was put elsewhere.
+HD void begin_hold(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
+    int slot = p.scenery.n_agents + k, a = b.holders[slot];
+    if (a < 0)
+        return;
+    const Hull& agent = b.hulls[a];
+    float dx = b.hulls[slot].x - agent.x, dy = b.hulls[slot].y - agent.y;
+    float x = agent.cosine * dx + agent.sine * dy, y = agent.cosine * dy - agent.sine * dx;
+    Body& body = bodies_of(p.objects)[env * p.objects.n_bodies + k];
+    if (body.grabbed) {
+        body.grabbed = 0;
+        body.hold_x = b.hold_x[k] = x;
+        body.hold_y = b.hold_y[k] = y;
+        body.hold_turn = b.hold_turn[k] = b.angles[slot] - b.angles[a];
+    }
+    float off_x = x - b.hold_x[k], off_y = y - b.hold_y[k];
+    if (off_x * off_x + off_y * off_y > MAX_STRETCH * MAX_STRETCH)
+        b.holders[slot] = -1;
+}
+
+// The speed of the fastest point of a hull.
+HD float speed_of(float vx, float vy, float turning, float extent) {
+    return SQRT(vx * vx + vy * vy) + ABS(turning) * extent;
+}
+
+// How fast a slot may become in a step: what is held, as fast as its holder moves and turns it.
+HD float top_speed(const Bodies& b, int i, int n_agents) {
+    if (!b.exists[i])
+        return 0.f;
+    float now = speed_of(b.velocity.x[i], b.velocity.y[i], b.velocity.turn[i], b.extent[i]);
+    if (i < n_agents)
+        return maxf(now, speed_of(b.wish_x[i], b.wish_y[i], b.velocity.turn[i], b.extent[i]));
+    int a = b.holders[i];
+    if (a < 0)
+        return now;
+    float arm = speed_of(b.hold_x[i - n_agents], b.hold_y[i - n_agents], 1.f, b.extent[i]);
+    return maxf(now, speed_of(b.velocity.x[a], b.velocity.y[a], b.velocity.turn[a], arm));
+}
+
+// Appends to a list what those threads of a group have that have something, in the order of their
+// ranks. Returns the index of this thread's.
+HD int append(const SingleThread&, int has, int& n) { return has ? n++ : -1; }
+
+// A bit for each thread of a group, set where `is_set`.
+HD unsigned int ballot(const SingleThread&, int is_set) { return is_set ? 1u : 0u; }
+
+// Lists `candidate` if this thread has one. If the list is full, its slots do not move in this
+// step.
+template <class Group>
+HD void add_candidate(const Group& group, Bodies& b, int has, int a, int kind, int index, int& n) {
+    int at = append(group, has, n);
+    if (at >= 0 && at < MAX_CANDIDATES)
+        b.candidates[at] = a | kind << 5 | index << 7;
+    if (at < MAX_CANDIDATES)
+        return;
+    b.overlaps[a] = 1;
+    if (kind == SLOT)
+        b.overlaps[index] = 1;
+}
+
+// Returns 1 if an object that is no body, of environment `env`, is an obstacle within reach of slot
+// a. Some are larger than a disc of their size: 1.5 is beyond crates' corners.
+HD int is_near(const ObjectsParams& o, const Bodies& b, int env, int a, int k, float reach) {
+    Object object = objects_of(o)[env * o.n_objects + k];
+    float apart = b.extent[a] + 1.5f * object.size + reach;
+    return o.object_bodies[k] < 0 && is_obstacle(object) && ABS(object.x - b.hulls[a].x) <= apart &&
+           ABS(object.y - b.hulls[a].y) <= apart;
+}
+
+// Lists all pairs that may touch while nothing moves further than `reach`. Returns their number.
+template <class Group>
+HD int find_candidates(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int env,
+                       float reach) {
+    const SceneryParams& s = p.scenery;
+    Walls walls = walls_of(s, layout_of(s, env, p.error_flag));
+    int n_slots = n_slots_of(p), n = 0;
+    for (int a = 0; a < n_slots; a++) {
+        if (!b.exists[a])
+            continue;
+        const Hull& hull = b.hulls[a];
+        float apart = b.extent[a] + reach;
+        for (int start = a + 1; start < n_slots; start += Group::SIZE) {
+            int c = start + group.rank, has = c < n_slots;
+            if (has) {
+                float both = apart + b.extent[c] + reach;
+                has = b.exists[c] && (b.inv_mass[a] > 0.f || b.inv_mass[c] > 0.f) &&
+                      ABS(b.hulls[c].x - hull.x) <= both && ABS(b.hulls[c].y - hull.y) <= both;
+            }
+            add_candidate(group, b, has, a, SLOT, c, n);
+        }
+        if (b.inv_mass[a] == 0.f)
+            continue;
+        for (int start = walls.first_box; start < walls.end_box; start += Group::SIZE) {
+            int i = start + group.rank, meets = 0;
+            if (i < walls.end_box) {
+                Float4 box = LOAD((const Float4*)s.boxes + i);
+                meets = boxes_meet(hull.x, hull.y, 0.f, 0.f, box.x, box.y, box.z, box.w, apart);
+            }
+            unsigned int boxes = ballot(group, meets);
+            for (int k = 0; boxes; k++, boxes >>= 1) {
+                if (!(boxes & 1))
+                    continue;
+                int first = walls.first_wall + BOX_WALLS * (start - walls.first_box + k);
+                int end = mini(first + BOX_WALLS, walls.end_wall);
+                for (int j = first; j < end; j += Group::SIZE) {
+                    int has = j + group.rank < end;
+                    if (has) {
+                        Float4 wall = LOAD((const Float4*)s.walls + j + group.rank);
+                        has = boxes_meet(hull.x, hull.y, 0.f, 0.f, wall.x, wall.y, wall.z, wall.w,
+                                         apart);
+                    }
+                    add_candidate(group, b, has, a, WALL, j + group.rank - walls.first_wall, n);
+                }
+            }
+        }
+        const ObjectsParams& o = p.objects;
+        if (o.n_objects > o.n_bodies)
+            for (int start = 0; start < o.n_objects; start += Group::SIZE) {
+                int k = start + group.rank;
+                int has = k < o.n_objects && is_near(o, b, env, a, k, reach);
+                add_candidate(group, b, has, a, OBJECT, k, n);
+            }
+    }
+    return mini(n, MAX_CANDIDATES);
+}
+
+// The second hull of a candidate, as it is, or as it was before the substep.
+HD Hull other_hull(const PhysicsBodiesParams& p, const Bodies& b, int env, int candidate,
+                   int is_before) {
+    int kind = candidate >> 5 & 3, index = candidate >> 7;
+    if (kind == SLOT)
+        return is_before ? b.before[index] : b.hulls[index];
+    const SceneryParams& s = p.scenery;
+    if (kind == WALL) {
+        int layout = layout_of(s, env, p.error_flag);
+        return hull_of(LOAD((const Float4*)s.walls + s.wall_starts[layout] + index));
+    }
+    const ObjectsParams& o = p.objects;
+    Object object = objects_of(o)[env * o.n_objects + index];
+    Hull hull = {object.x, object.y, 0.f, 1.f, object.size, half_width_of(o, index, object.size)};
+    turn_hull(hull, object.angle);
+    return hull;
+}
+
+// Returns 1 if the centre of a hull that was at `old` has passed through a wall or a door.
+HD int passes(const Hull& old, const Hull& now, const Hull& wall) {
+    float ex = wall.cosine * wall.hx, ey = wall.sine * wall.hx;
+    return wall.hy == 0.f && cuts(wall.x - ex, wall.y - ey, wall.x + ex, wall.y + ey, old.x, old.y,
+                                  now.x - old.x, now.y - old.y);
+}
+
+// Marks the slots of a candidate that overlap more than they may, and more than before the substep.
+// Returns 1 if there are any that have not been taken back yet.
+HD int mark_overlap(const PhysicsBodiesParams& p, Bodies& b, int env, int candidate, const Touch& t,
+                    const Hull& other) {
+    int a = candidate & 31, kind = candidate >> 5 & 3, index = candidate >> 7;
+    int is_fixed = b.taken_back[a] && (kind != SLOT || b.taken_back[index]);
+    int is_through = kind != SLOT && passes(b.before[a], b.hulls[a], other);
+    float gap = gap_of(t);
+    if (is_fixed || (gap >= -MAX_OVERLAP && !is_through))
+        return 0;
+    Hull old = other_hull(p, b, env, candidate, 1);
+    if (!is_through && gap >= gap_of(touch(b.before[a], old)) - 1e-6f)
+        return 0;
+    b.overlaps[a] = 1;
+    if (kind == SLOT)
+        b.overlaps[index] = 1;
+    return 1;
+}
+
+// Numbers touches so that those with the same number share no slot that moves, and each comes after
+// all earlier touches of its slots.
+HD void number_levels(Bodies& b, int n_slots, int n_touches) {
+    for (int i = 0; i < n_slots; i++)
+        b.last[i] = 0;
+    b.n_levels = 0;
+    for (int k = 0; k < n_touches; k++) {
+        int a = b.touch_a[k], c = b.touch_b[k];
+        int moves_a = b.inv_mass[a] > 0.f, moves_c = c >= 0 && b.inv_mass[c] > 0.f;
+        int level = maxi(moves_a ? b.last[a] : 0, moves_c ? b.last[c] : 0) + 1;
+        if (moves_a)
+            b.last[a] = level;
+        if (moves_c)
+            b.last[c] = level;
+        b.levels[k] = level;
+        b.n_levels = maxi(b.n_levels, level);
+    }
+}
+
+// Returns 1 if a candidate overlaps, beyond the slop, or has passed through a wall.
+HD int is_bad(const Bodies& b, int candidate, const Touch& t, const Hull& other) {
+    int a = candidate & 31, kind = candidate >> 5 & 3;
+    return gap_of(t) < -SLOP || (kind != SLOT && passes(b.before[a], b.hulls[a], other));
+}
+
+// Finds the candidates that are within reach, per slot, of touching. With `checks`, also marks
+// those that overlap too much. Returns 1 if any do, else 0; without, 1 if any is_bad.
+template <class Group>
+HD int find_touches(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int env,
+                    int n_candidates, float reach, int checks, int& n_touches) {
+    int n = 0;
+    unsigned int any = 0;
+    for (int start = 0; start < n_candidates; start += Group::SIZE) {
+        int has = start + group.rank < n_candidates, candidate = 0;
+        Touch t;
+        if (has) {
+            candidate = b.candidates[start + group.rank];
+            int a = candidate & 31, is_slot = (candidate >> 5 & 3) == SLOT;
+            Hull other = other_hull(p, b, env, candidate, 0);
+            t = touch(b.hulls[a], other);
+            any |= checks ? mark_overlap(p, b, env, candidate, t, other)
+                          : is_bad(b, candidate, t, other);
+            has = gap_of(t) < (is_slot ? 2.f * reach : reach);
+        }
+        int at = append(group, has, n);
+        if (at >= 0 && at < MAX_TOUCHES) {
+            b.touch_a[at] = candidate & 31;
+            b.touch_b[at] = (candidate >> 5 & 3) == SLOT ? candidate >> 7 : -1;
+            b.touches[at] = t;
+            b.impulses[at][0] = 0.f;
+            b.impulses[at][1] = 0.f;
+        }
+    }
+    n_touches = mini(n, MAX_TOUCHES);
+    sync(group);
+    if (group.rank == 0)
+        number_levels(b, n_slots_of(p), n_touches);
+    sync(group);
+    return reduce_or(group, any) != 0;
+}
+
+// How much an impulse moves a slot. Agents give way to all else when overlaps end, so that bodies
+// at rest, which friction holds, stay where they are.
+HD float inverse_of(const Bodies& b, int slot, int n_agents, int is_shift) {
+    return is_shift && slot < n_agents ? LIGHT * b.inv_mass[slot] : b.inv_mass[slot];
+}
+
+HD void push(const Bodies& b, Motion& motion, int slot, float inverse, float jx, float jy,
+             float turn) {
+    if (!(inverse > 0.f))
+        return;
+    motion.x[slot] += inverse * jx;
+    motion.y[slot] += inverse * jy;
+    motion.turn[slot] += b.inv_inertia[slot] * turn;
+}
+
+// Solves a touch: changes its slots' motions, which last h seconds, by impulses along the normal,
+// never below 0 in sum, after which no point overlaps, or more than SLOP if these are shifts. Two
+// points are solved together, exactly.
+HD void solve_touch(Bodies& b, int k, int n_agents, float inv_h, int is_shift) {
+    Motion& m = is_shift ? b.shift : b.velocity;
+    int a = b.touch_a[k], c = b.touch_b[k];
+    const Touch& t = b.touches[k];
+    float mass_a = inverse_of(b, a, n_agents, is_shift), inertia_a = b.inv_inertia[a];
+    float mass_c = c < 0 ? 0.f : inverse_of(b, c, n_agents, is_shift);
+    float inertia_c = c < 0 ? 0.f : b.inv_inertia[c], turn_c = c < 0 ? 0.f : m.turn[c];
+    float x = (c < 0 ? 0.f : m.x[c]) - m.x[a], y = (c < 0 ? 0.f : m.y[c]) - m.y[a];
+    float turn_a = inertia_a > 0.f ? m.turn[a] : 0.f;  // a disc's turning moves no point of touch
+    float along = t.nx * x + t.ny * y, both = mass_a + mass_c;
+    float old[2] = {b.impulses[k][0], b.impulses[k][1]}, mass[2], target[2];
+    float between =
+        both + inertia_a * t.arms_a[0] * t.arms_a[1] + inertia_c * t.arms_b[0] * t.arms_b[1];
+    for (int i = 0; i < 2; i++) {
+        float gap = t.gaps[i];
+        float room = is_shift ? maxf(gap + SLOP, -MAX_SHIFT) : maxf(gap, 0.f) * inv_h;
+        mass[i] =
+            both + inertia_a * t.arms_a[i] * t.arms_a[i] + inertia_c * t.arms_b[i] * t.arms_b[i];
+        target[i] = along + turn_c * t.arms_b[i] - turn_a * t.arms_a[i] + room;
+    }
+    // without the impulses so far: mass x impulses + target >= 0
+    float one = target[0] - mass[0] * old[0], two = target[1] - mass[1] * old[1];
+    float first = 0.f, second = 0.f;
+    if (t.n == 2) {
+        one -= between * old[1];
+        two -= between * old[0];
+        float determinant = mass[0] * mass[1] - between * between;
+        float both_first = between * two - mass[1] * one;
+        float both_second = between * one - mass[0] * two;
+        float only_first = -one / mass[0], only_second = -two / mass[1];
+        if (determinant > 1e-3f * mass[0] * mass[1] && both_first >= 0.f && both_second >= 0.f) {
+            first = both_first / determinant;
+            second = both_second / determinant;
+        } else if (only_first >= 0.f && between * only_first + two >= 0.f) {
+            first = only_first;
+        } else if (only_second >= 0.f && between * only_second + one >= 0.f) {
+            second = only_second;
+        } else if (t.gaps[0] <= t.gaps[1]) {  // none, or nearly the same point
+            first = maxf(only_first, 0.f);
+        } else {
+            second = maxf(only_second, 0.f);
+        }
+    } else {
+        first = maxf(-one / mass[0], 0.f);
+    }
+    b.impulses[k][0] = first;
+    b.impulses[k][1] = second;
+    if (first > 0.f || second > 0.f) {
+        b.hit[a] = 1;
+        if (c >= 0)
+            b.hit[c] = 1;
+    }
+    float d1 = first - old[0], d2 = second - old[1], sum = d1 + d2;
+    push(b, m, a, mass_a, -sum * t.nx, -sum * t.ny, -(d1 * t.arms_a[0] + d2 * t.arms_a[1]));
+    if (c >= 0)
+        push(b, m, c, mass_c, sum * t.nx, sum * t.ny, d1 * t.arms_b[0] + d2 * t.arms_b[1]);
+}
+
+// Keeps what is held where it was grabbed, in its holder's frame, by at most `grip` newtons.
+HD void solve_hold(Bodies& b, int k, int slot, float h, float grip) {
+    int a = b.holders[slot];
+    float* impulse = b.hold[k];
+    if (a < 0)
+        return;
+    Motion& m = b.velocity;
+    const Hull &agent = b.hulls[a], &body = b.hulls[slot];
+    float mass_a = b.inv_mass[a], mass = b.inv_mass[slot], inertia = b.inv_inertia[slot];
+    float rx = agent.cosine * b.hold_x[k] - agent.sine * b.hold_y[k];
+    float ry = agent.sine * b.hold_x[k] + agent.cosine * b.hold_y[k];
+    float rate = 0.2f / h;  // at which what is out of place comes back
+    float off = wrap_degrees(b.angles[slot] - b.angles[a] - b.hold_turn[k]) * RADIANS;
+    float limit = grip * h, max_turn = limit * SQRT(mass / inertia);
+    float turn = impulse[2] - (m.turn[slot] - m.turn[a] + rate * off) / inertia;
+    turn = clamp(turn, -max_turn, max_turn);
+    push(b, m, slot, mass, 0.f, 0.f, turn - impulse[2]);
+    impulse[2] = turn;
+    float vx = m.x[slot] - m.x[a] + m.turn[a] * ry + rate * (body.x - agent.x - rx);
+    float vy = m.y[slot] - m.y[a] - m.turn[a] * rx + rate * (body.y - agent.y - ry);
+    float jx = impulse[0] - vx / (mass_a + mass), jy = impulse[1] - vy / (mass_a + mass);
+    float size = SQRT(jx * jx + jy * jy), scale = size > limit ? limit / size : 1.f;
+    jx *= scale;
+    jy *= scale;
+    push(b, m, slot, mass, jx - impulse[0], jy - impulse[1], 0.f);
+    push(b, m, a, mass_a, impulse[0] - jx, impulse[1] - jy, 0.f);
+    impulse[0] = jx;
+    impulse[1] = jy;
+}
+
+// Friction of a body with the floor: it stops the body, by at most so much force and torque.
+HD void solve_drag(Bodies& b, int i, float h) {
+    if (!(b.inv_mass[i] > 0.f) || !(b.drag[i] > 0.f))
+        return;
+    float limit = b.drag[i] * h;
+    float jx = b.drag_x[i] - b.velocity.x[i] / b.inv_mass[i],
+          jy = b.drag_y[i] - b.velocity.y[i] / b.inv_mass[i];
+    float size = SQRT(jx * jx + jy * jy);
+    if (size > limit) {
+        jx *= limit / size;
+        jy *= limit / size;
+        b.velocity.x[i] += b.inv_mass[i] * (jx - b.drag_x[i]);
+        b.velocity.y[i] += b.inv_mass[i] * (jy - b.drag_y[i]);
+    } else {
+        b.velocity.x[i] = 0.f;
+        b.velocity.y[i] = 0.f;
+    }
+    b.drag_x[i] = jx;
+    b.drag_y[i] = jy;
+    float torque = limit * ARM * SQRT(b.inv_mass[i] / b.inv_inertia[i]);
+    float turn = b.drag_turn[i] - b.velocity.turn[i] / b.inv_inertia[i];
+    if (ABS(turn) > torque) {
+        turn = signed_as(torque, turn);
+        b.velocity.turn[i] += b.inv_inertia[i] * (turn - b.drag_turn[i]);
+    } else {
+        b.velocity.turn[i] = 0.f;
+    }
+    b.drag_turn[i] = turn;
+}
+
+// Drives an agent towards the velocity that it wishes, by at most `force`, and forgets the last
+// substep's impulses.
+HD void drive(Bodies& b, int i, int n_agents, float force, float h) {
+    b.drag_x[i] = b.drag_y[i] = b.drag_turn[i] = 0.f;
+    b.before[i] = b.hulls[i];
+    b.angles_before[i] = b.angles[i];
+    b.overlaps[i] = b.taken_back[i] = 0;
+    if (i >= n_agents)
+        for (int k = 0; k < 3; k++)
+            b.hold[i - n_agents][k] = 0.f;
+    if (i >= n_agents || !(b.inv_mass[i] > 0.f))
+        return;
+    float dx = b.wish_x[i] - b.velocity.x[i], dy = b.wish_y[i] - b.velocity.y[i];
+    float size = SQRT(dx * dx + dy * dy), limit = b.inv_mass[i] * force * h;
+    if (size > limit) {
+        b.velocity.x[i] += dx * (limit / size);
+        b.velocity.y[i] += dy * (limit / size);
+    } else {
+        b.velocity.x[i] = b.wish_x[i];
+        b.velocity.y[i] = b.wish_y[i];
+    }
+}
+
+// Moves a slot for h seconds, no point of it by more than `limit` metres per second.
+HD void displace(Bodies& b, int i, Motion& m, float h, float limit) {
+    if (!(b.inv_mass[i] > 0.f))
+        return;
+    float turn = b.inv_inertia[i] > 0.f ? m.turn[i] : 0.f;
+    float speed = speed_of(m.x[i], m.y[i], turn, b.extent[i]);
+    if (speed > limit) {
+        float slower = limit / speed;
+        m.x[i] *= slower;
+        m.y[i] *= slower;
+        m.turn[i] *= b.inv_inertia[i] > 0.f ? slower : 1.f;
+    }
+    b.hulls[i].x += h * m.x[i];
+    b.hulls[i].y += h * m.y[i];
+    if (m.turn[i] != 0.f) {
+        b.angles[i] += h * (m.turn[i] * DEGREES);
+        turn_hull(b.hulls[i], b.angles[i]);
+    }
+}
+
+// Puts a slot back to where it was before the substep, at rest. An agent still turns.
+HD void take_back(Bodies& b, int i, int n_agents) {
+    if (!b.overlaps[i] || b.taken_back[i])
+        return;
+    b.taken_back[i] = 1;
+    b.hit[i] = 1;
+    b.hulls[i].x = b.before[i].x;
+    b.hulls[i].y = b.before[i].y;
+    b.velocity.x[i] = b.velocity.y[i] = 0.f;
+    if (i < n_agents)
+        return;
+    b.hulls[i] = b.before[i];
+    b.angles[i] = b.angles_before[i];
+    b.velocity.turn[i] = 0.f;
+}
+
+// Adds up what holding took in a substep.
+HD void add_load(Bodies& b, int k) {
+    b.load[k] += SQRT(b.hold[k][0] * b.hold[k][0] + b.hold[k][1] * b.hold[k][1]);
+    b.load_turn[k] += ABS(b.hold[k][2]);
+}
+
+// Solves touches once, in order.
+template <class Group>
+HD void solve_touches(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches,
+                      float inv_h, int is_shift) {
+    for (int level = 1; level <= b.n_levels; level++) {
+        for (int k = group.rank; k < n_touches; k += Group::SIZE)
+            if (b.levels[k] == level)
+                solve_touch(b, k, p.scenery.n_agents, inv_h, is_shift);
+        sync(group);
+    }
+}
+
+// Changes velocities for a substep of h seconds.
+template <class Group>
+HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches, float h) {
+    int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);
+    for (int i = 0; i < ITERATIONS; i++) {
+        if (group.rank == 0)
+            for (int k = 0; k < p.objects.n_bodies; k++)
+                solve_hold(b, k, n_agents + k, h, p.grip);
+        sync(group);
+        solve_touches(p, group, b, n_touches, 1.f / h, 0);
+        for (int k = n_agents + group.rank; k < n_slots; k += Group::SIZE)
+            solve_drag(b, k, h);
+        sync(group);
+    }
+    for (int k = n_agents + group.rank; k < n_slots; k += Group::SIZE)
+        add_load(b, k - n_agents);
+}
+
+// Shifts apart what overlaps.
+template <class Group>
+HD void end_overlaps(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches) {
+    int n_slots = n_slots_of(p);
+    for (int i = group.rank; i < n_slots; i += Group::SIZE)
+        b.shift.x[i] = b.shift.y[i] = b.shift.turn[i] = 0.f;
+    sync(group);
+    for (int i = 0; i < ITERATIONS; i++)
+        solve_touches(p, group, b, n_touches, 1.f, 1);
+    for (int i = group.rank; i < n_slots; i += Group::SIZE)
+        displace(b, i, b.shift, 1.f, MAX_SHIFT);
+    sync(group);
+}
+
+// Writes what an agent did, and the fraction of what it wished, as `physics` does.
+HD void end_agent(const PhysicsBodiesParams& p, const Bodies& b, int env, int a) {
+    int i = env * p.scenery.n_agents + a;
+    float *position = p.positions + 2 * i, *velocity = p.velocity + 2 * i;
+    float wish_x = b.wish_x[a] * p.seconds, wish_y = b.wish_y[a] * p.seconds;
+    float wish2 = wish_x * wish_x + wish_y * wish_y;
+    float moved = (b.hulls[a].x - position[0]) * wish_x + (b.hulls[a].y - position[1]) * wish_y;
+    p.progress[i] = b.hit[a] && wish2 > 0.f ? clamp(moved / wish2, 0.f, SHORTENING) : 1.f;
+    position[0] = b.hulls[a].x;
+    position[1] = b.hulls[a].y;
+    velocity[0] = b.velocity.x[a];
+    velocity[1] = b.velocity.y[a];
+    p.angles[i] = wrap_degrees(b.angles[a]);
+    flag_nonfinite(p.error_flag, env, position[0], position[1], p.angles[i]);
+}
+
+// Writes how a body moved. Its holder lets go if it had to use all its force, on average.
+HD void end_body(const PhysicsBodiesParams& p, const Bodies& b, int env, int k) {
+    const ObjectsParams& o = p.objects;
+    int slot = p.scenery.n_agents + k;
+    Body& body = bodies_of(o)[env * o.n_bodies + k];
+    float limit = 0.99f * p.grip * p.seconds;
+    float arm = SQRT(b.inv_mass[slot] / b.inv_inertia[slot]);
+    int slips = b.load[k] >= limit || b.load_turn[k] >= limit * arm;
+    body.holder = slips ? -1 : b.holders[slot];
+    if (!(b.inv_mass[slot] > 0.f))
+        return;
+    Object& object = objects_of(o)[env * o.n_objects + o.body_objects[k]];
+    object.x = b.hulls[slot].x;
+    object.y = b.hulls[slot].y;
+    if (b.angles[slot] != object.angle)
+        object.angle = wrap_degrees(b.angles[slot]);
+    body.vx = b.velocity.x[slot];
+    body.vy = b.velocity.y[slot];
+    body.turning = b.velocity.turn[slot] * DEGREES;
+}
+
+// Moves all agents and bodies of an environment by a step.
+template <class Group>
+HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int env) {
+    int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);
+    for (int i = group.rank; i < n_slots; i += Group::SIZE) {
+        if (i < n_agents)
+            begin_agent(p, b, env, i);
+        else
+            begin_body(p, b, env, i - n_agents);
+        b.hit[i] = b.overlaps[i] = 0;
+        b.before[i] = b.hulls[i];
+    }
+    sync(group);
+    for (int k = group.rank; k < n_slots - n_agents; k += Group::SIZE)
+        begin_hold(p, b, env, k);
+    sync(group);
+    for (int i = group.rank; i < n_slots; i += Group::SIZE)
+        b.speeds[i] = top_speed(b, i, n_agents);
+    sync(group);
+    float top = 0.f;
+    for (int i = 0; i < n_slots; i++)
+        top = maxf(top, b.speeds[i]);
+    if (top == 0.f) {  // all rest
+        for (int a = group.rank; a < n_agents; a += Group::SIZE)
+            p.progress[env * n_agents + a] = 1.f;
+        return;
+    }
+    float limit = top + MIN_LIMIT, h = p.seconds * (1.f / SUBSTEPS);
+    float reach = limit * h + MAX_SHIFT;
+    int n_candidates = find_candidates(p, group, b, env, SUBSTEPS * reach), n_touches;
+    sync(group);
+    for (int i = group.rank; i < n_slots; i += Group::SIZE)
+        if (b.overlaps[i]) {  // in a pair that is not listed
+            b.inv_mass[i] = b.inv_inertia[i] = 0.f;
+            b.velocity.x[i] = b.velocity.y[i] = 0.f;
+        }
+    sync(group);
+    find_touches(p, group, b, env, n_candidates, reach, 0, n_touches);
+    for (int substep = 0; substep < SUBSTEPS; substep++) {
+        for (int i = group.rank; i < n_slots; i += Group::SIZE)
+            drive(b, i, n_agents, p.force, h);
+        sync(group);
+        solve(p, group, b, n_touches, h);
+        for (int i = group.rank; i < n_slots; i += Group::SIZE)
+            displace(b, i, b.velocity, h, limit);
+        sync(group);
+        if (find_touches(p, group, b, env, n_candidates, reach, 0, n_touches)) {
+            end_overlaps(p, group, b, n_touches);
+            while (find_touches(p, group, b, env, n_candidates, reach, 1, n_touches)) {
+                for (int i = group.rank; i < n_slots; i += Group::SIZE)
+                    take_back(b, i, n_agents);
+                sync(group);
+            }
+        }
+    }
+    for (int i = group.rank; i < n_slots; i += Group::SIZE)
+        if (i < n_agents)
+            end_agent(p, b, env, i);
+        else
+            end_body(p, b, env, i - n_agents);
+}
