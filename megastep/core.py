@@ -75,7 +75,10 @@ class Core:
         scenery = engine.Scenery(self.n_agents, shared.layouts, shared.model, widths, layout)
         if shared.objects is not None:
             objects = copy.copy(shared.objects)
-            own = {name: getattr(objects, name)[[e]] for name in ("records", "lines", "texels", "bodies")}
+            own = {
+                name: getattr(objects, name)[[e]]
+                for name in ("records", "lines", "texels", "bodies")
+            }
             vars(objects).update(own, n_envs=1)
             scenery.objects = objects
         yaws = self.agents.yaws.tolist()

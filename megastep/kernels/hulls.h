@@ -123,21 +123,35 @@ HD Touch touch_boxes(const Hull& a, const Hull& b) {
     }
     Touch t;
     t.n = low > high ? 0 : high - low > 1e-3f && reach > 0.f ? 2 : 1;
-    float cross_sign = is_x ? -up : up;  // of (along, above) with the normal
+    float n_along = 0.f, n_above = up, corner_gap = 0.f;
+    if (t.n == 0) {  // beside the side: a corner against its nearer end
+        float at = ABS(mid_along + end_along) <= ABS(mid_along - end_along) ? 1.f : -1.f;
+        float to_along = mid_along + at * end_along, to_above = mid_above + at * end_above;
+        to_along -= signed_as(half, to_along);
+        to_above -= up * height;
+        corner_gap = SQRT(to_along * to_along + to_above * to_above);
+        if (!(to_above * up > 0.f))
+            return t;
+        n_along = to_along / corner_gap;
+        n_above = to_above / corner_gap;
+        low = high = at;
+        t.n = 1;
+    }
+    float turned = is_x ? 1.f : -1.f;  // the sign of cross products of (above, along)
     for (int i = 0; i < 2; i++) {
         float at = t.n == 1 ? 0.5f * (low + high) : i ? high : low;
-        float point_along = mid_along + at * end_along;
-        t.gaps[i] = up * (mid_above + at * end_above) - height;
-        t.arms_a[i] = cross_sign * point_along;
-        t.arms_b[i] = cross_sign * (point_along - along);
+        float at_along = mid_along + at * end_along, at_above = mid_above + at * end_above;
+        t.gaps[i] = n_along != 0.f ? corner_gap : up * at_above - height;
+        t.arms_a[i] = turned * (at_above * n_along - at_along * n_above);
+        t.arms_b[i] = turned * ((at_above - above) * n_along - (at_along - along) * n_above);
     }
-    float nx = is_x ? up : 0.f, ny = is_x ? 0.f : up;
+    float nx = is_x ? n_above : n_along, ny = is_x ? n_along : n_above;
     t.nx = own.cosine * nx - own.sine * ny;
     t.ny = own.sine * nx + own.cosine * ny;
     return is_a ? t : swapped(t);
 }
 
-HD Touch touch(const Hull& a, const Hull& b) {
+RARE Touch touch(const Hull& a, const Hull& b) {
     if (is_disc(a))
         return is_disc(b) ? touch_discs(a, b) : swapped(touch_disc(b, a));
     return is_disc(b) ? touch_disc(a, b) : touch_boxes(a, b);

@@ -46,9 +46,9 @@ struct Bodies {
     Hull hulls[MAX_SLOTS], before[MAX_SLOTS];  // now, and before the substep
     float angles[MAX_SLOTS], angles_before[MAX_SLOTS];
     Motion velocity, shift;                      // m/s and rad/s; metres and radians
-    float wish_x[MAX_SLOTS], wish_y[MAX_SLOTS];  // m/s, of agents
+    float wish_x[MAX_SLOTS], wish_y[MAX_SLOTS];  // m/s, 0 of bodies
     float inv_mass[MAX_SLOTS], inv_inertia[MAX_SLOTS];
-    float drag[MAX_SLOTS];  // newtons, at most, of friction with the floor
+    float drag[MAX_SLOTS];  // newtons, at most, between slot and floor
     float drag_x[MAX_SLOTS], drag_y[MAX_SLOTS], drag_turn[MAX_SLOTS];  // impulses in this substep
     float hold_x[MAX_BODIES], hold_y[MAX_BODIES], hold_turn[MAX_BODIES];
     float hold[MAX_BODIES][3];                      // impulse and torque in this substep
@@ -90,7 +90,7 @@ HD void begin_agent(const PhysicsBodiesParams& p, Bodies& b, int env, int a) {
     b.velocity.turn[a] = p.angvelocity[i] * RADIANS;
     b.inv_mass[a] = 1.f / AGENT_MASS;
     b.inv_inertia[a] = 0.f;  // nothing but its action turns it
-    b.drag[a] = 0.f;
+    b.drag[a] = p.force;
     b.exists[a] = 1;
     b.holders[a] = -1;
     b.extent[a] = b.hulls[a].hx;
@@ -117,6 +117,7 @@ HD void begin_body(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
     b.velocity.x[slot] = moves ? body.vx : 0.f;
     b.velocity.y[slot] = moves ? body.vy : 0.f;
     b.velocity.turn[slot] = moves ? body.turning * RADIANS : 0.f;
+    b.wish_x[slot] = b.wish_y[slot] = 0.f;
     b.drag[slot] = body.friction * body.mass * GRAVITY;
     b.load[k] = 0.f;
     b.load_turn[k] = 0.f;
@@ -376,7 +377,7 @@ HD void push(const Bodies& b, Motion& motion, int slot, float inverse, float jx,
 // Solves a touch: changes its slots' motions, which last h seconds, by impulses along the normal,
 // never below 0 in sum, after which no point overlaps, or more than SLOP if these are shifts. Two
 // points are solved together, exactly.
-HD void solve_touch(Bodies& b, int k, int n_agents, float inv_h, int is_shift) {
+RARE void solve_touch(Bodies& b, int k, int n_agents, float inv_h, int is_shift) {
     Motion& m = is_shift ? b.shift : b.velocity;
     int a = b.touch_a[k], c = b.touch_b[k];
     const Touch& t = b.touches[k];
@@ -464,71 +465,58 @@ HD void solve_hold(Bodies& b, int k, int slot, float h, float grip) {
     impulse[1] = jy;
 }
 
-// Friction of a body with the floor: it stops the body, by at most so much force and torque.
+// The floor's impulse on a slot: it brings the slot to the velocity that it wishes, which of a body
+// is none, by at most so much force, and for bodies torque.
 HD void solve_drag(Bodies& b, int i, float h) {
     if (!(b.inv_mass[i] > 0.f) || !(b.drag[i] > 0.f))
         return;
-    float limit = b.drag[i] * h;
-    float jx = b.drag_x[i] - b.velocity.x[i] / b.inv_mass[i],
-          jy = b.drag_y[i] - b.velocity.y[i] / b.inv_mass[i];
+    Motion& m = b.velocity;
+    float limit = b.drag[i] * h, mass = b.inv_mass[i], inertia = b.inv_inertia[i];
+    float jx = b.drag_x[i] + (b.wish_x[i] - m.x[i]) / mass;
+    float jy = b.drag_y[i] + (b.wish_y[i] - m.y[i]) / mass;
     float size = SQRT(jx * jx + jy * jy);
     if (size > limit) {
         jx *= limit / size;
         jy *= limit / size;
-        b.velocity.x[i] += b.inv_mass[i] * (jx - b.drag_x[i]);
-        b.velocity.y[i] += b.inv_mass[i] * (jy - b.drag_y[i]);
+        m.x[i] += mass * (jx - b.drag_x[i]);
+        m.y[i] += mass * (jy - b.drag_y[i]);
     } else {
-        b.velocity.x[i] = 0.f;
-        b.velocity.y[i] = 0.f;
+        m.x[i] = b.wish_x[i];
+        m.y[i] = b.wish_y[i];
     }
     b.drag_x[i] = jx;
     b.drag_y[i] = jy;
-    float torque = limit * ARM * SQRT(b.inv_mass[i] / b.inv_inertia[i]);
-    float turn = b.drag_turn[i] - b.velocity.turn[i] / b.inv_inertia[i];
+    if (!(inertia > 0.f))
+        return;
+    float torque = limit * ARM * SQRT(mass / inertia);
+    float turn = b.drag_turn[i] - m.turn[i] / inertia;
     if (ABS(turn) > torque) {
         turn = signed_as(torque, turn);
-        b.velocity.turn[i] += b.inv_inertia[i] * (turn - b.drag_turn[i]);
+        m.turn[i] += inertia * (turn - b.drag_turn[i]);
     } else {
-        b.velocity.turn[i] = 0.f;
+        m.turn[i] = 0.f;
     }
     b.drag_turn[i] = turn;
 }
 
-// Drives an agent towards the velocity that it wishes, by at most `force`, and forgets the last
-// substep's impulses.
-HD void drive(Bodies& b, int i, int n_agents, float force, float h) {
+// Forgets the last substep's impulses.
+HD void begin_substep(Bodies& b, int i, int n_agents) {
     b.drag_x[i] = b.drag_y[i] = b.drag_turn[i] = 0.f;
     b.before[i] = b.hulls[i];
     b.angles_before[i] = b.angles[i];
     b.overlaps[i] = b.taken_back[i] = 0;
-    if (i >= n_agents)
-        for (int k = 0; k < 3; k++)
-            b.hold[i - n_agents][k] = 0.f;
-    if (i >= n_agents || !(b.inv_mass[i] > 0.f))
-        return;
-    float dx = b.wish_x[i] - b.velocity.x[i], dy = b.wish_y[i] - b.velocity.y[i];
-    float size = SQRT(dx * dx + dy * dy), limit = b.inv_mass[i] * force * h;
-    if (size > limit) {
-        b.velocity.x[i] += dx * (limit / size);
-        b.velocity.y[i] += dy * (limit / size);
-    } else {
-        b.velocity.x[i] = b.wish_x[i];
-        b.velocity.y[i] = b.wish_y[i];
-    }
+    for (int k = 0; k < 3 && i >= n_agents; k++)
+        b.hold[i - n_agents][k] = 0.f;
 }
 
-// Moves a slot for h seconds, no point of it by more than `limit` metres per second.
-HD void displace(Bodies& b, int i, Motion& m, float h, float limit) {
+// Moves a slot for h seconds, or for less: no point of it moves faster than `limit`.
+HD void displace(Bodies& b, int i, const Motion& m, float h, float limit) {
     if (!(b.inv_mass[i] > 0.f))
         return;
     float turn = b.inv_inertia[i] > 0.f ? m.turn[i] : 0.f;
     float speed = speed_of(m.x[i], m.y[i], turn, b.extent[i]);
-    if (speed > limit) {
-        float slower = limit / speed;
-        m.x[i] *= slower;
-        m.y[i] *= slower;
-        m.turn[i] *= b.inv_inertia[i] > 0.f ? slower : 1.f;
-    }
+    if (speed > limit)
+        h *= limit / speed;
     b.hulls[i].x += h * m.x[i];
     b.hulls[i].y += h * m.y[i];
     if (m.turn[i] != 0.f) {
@@ -576,6 +564,9 @@ template <class Group>
 HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches, float h) {
     int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);
     for (int i = 0; i < ITERATIONS; i++) {
+        for (int a = group.rank; a < n_agents; a += Group::SIZE)
+            solve_drag(b, a, h);
+        sync(group);
         if (group.rank == 0)
             for (int k = 0; k < p.objects.n_bodies; k++)
                 solve_hold(b, k, n_agents + k, h, p.grip);
@@ -680,7 +671,7 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
     find_touches(p, group, b, env, n_candidates, reach, 0, n_touches);
     for (int substep = 0; substep < SUBSTEPS; substep++) {
         for (int i = group.rank; i < n_slots; i += Group::SIZE)
-            drive(b, i, n_agents, p.force, h);
+            begin_substep(b, i, n_agents);
         sync(group);
         solve(p, group, b, n_touches, h);
         for (int i = group.rank; i < n_slots; i += Group::SIZE)

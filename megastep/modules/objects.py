@@ -3,8 +3,9 @@
 N environments, A agents per environment, K objects of a kind, D layouts.
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,8 +14,10 @@ from megastep import engine
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
-from megastep.engine.objects import MAX_OBJECTS, NUMBERS
+from megastep.engine.objects import FORCE, GRIP, MAX_MASS, MAX_OBJECTS
+from megastep.modules.kinds import Doors, Kind
 from megastep.modules.lifecycle import derived_seed
+from megastep.modules.movable import Movable
 from megastep.modules.spawning import MAX_SPAWNS, cached_points
 from megastep.ragged import RaggedNumpy
 from megastep.scene import linear
@@ -31,11 +34,7 @@ COLOURS = {
     "orange": "f07010",
     "violet": "6a18b8",
 }
-#: The tensors of a kind.
-TENSORS = "positions", "angles", "sizes", "colours", "visible", "solid", "open", "carriers"
-REACH = 0.05  # metres between surfaces at which an agent touches an object
-_DISC, _CRATE = NUMBERS["disc"], NUMBERS["crate"]
-_INTO_WALL = 0.001  # metres that a door is longer than its opening, on either side
+MAX_FRICTION = 100.0
 
 
 class Disc(NamedTuple):
@@ -43,15 +42,22 @@ class Disc(NamedTuple):
 
     count: int  # per environment
     radius: float = 0.1  # metres
-    solid: bool = False  # they stop agents
+    solid: bool = False  # they stop agents; movable ones do in any case
+    movable: bool = False  # agents push them
+    mass: float = 1.0  # kg, if movable; an agent has 1 kg
+    friction: float = 0.5  # coefficient with the floor, if movable
 
 
 class Crate(NamedTuple):
-    """A kind of square objects."""
+    """A kind of rectangular objects."""
 
     count: int  # per environment
     side: float = 0.3  # metres
-    solid: bool = True  # they stop agents
+    solid: bool = True  # as of discs, and so are the next three
+    movable: bool = False
+    mass: float = 1.0
+    friction: float = 0.5
+    width: float | None = None  # metres, up to the side; default: squares
 
 
 class Door(NamedTuple):
@@ -69,9 +75,10 @@ def doorways(geometries: Sequence[dotdict]) -> RaggedNumpy:
 
 
 class Objects:
-    """The objects of an environment, by kind: ``objects["key"]`` is a :class:`Kind`. They are
-    invisible until they are placed. Cameras see them, agents bump into the solid ones, and all that
-    an environment does with them is PyTorch on :attr:`Kind.positions` and other tensors.
+    """The objects of an environment, by kind: ``objects["key"]`` is a :class:`Kind`, or a
+    :class:`Movable` if the kind is movable. They are invisible until they are placed. Cameras see
+    them, agents bump into the solid ones, and all that an environment does with them is PyTorch on
+    :attr:`Kind.positions` and other tensors.
 
     Args:
         geometries: those that the scenery was made from.
@@ -81,6 +88,8 @@ class Objects:
         lit: see :class:`megastep.engine.Objects`.
         n_points: points per layout at which objects are placed.
         seed: of the points and draws. Default: the core's.
+        force: newtons, at most, by which an agent, of 1 kg, pushes.
+        grip: newtons, at most, between an agent and what it holds.
 
     Attributes:
         all: the :class:`megastep.engine.Objects` of all kinds.
@@ -100,6 +109,8 @@ class Objects:
         lit: bool = False,
         n_points: int = 128,
         seed: int | None = None,
+        force: float = FORCE,
+        grip: float = GRIP,
     ):
         if core.scenery.objects is not None:
             raise ValueError("core has objects: give all kinds to one Objects")
@@ -107,22 +118,32 @@ class Objects:
             raise ValueError("kinds must hold at least one kind of objects, but is empty")
         self.core = core
         geometries = geometries[: len(core.scenery.layouts)]
-        shapes, sizes, solid, names, slots = [], [], [], [], {}
+        shapes, sizes, widths, solid, movable, names, slots = [], [], [], [], [], [], {}
         openings = doorways(geometries)
         for name, kind in kinds.items():
             kind = Disc(kind) if isinstance(kind, int) else kind
             count = _count(name, kind, openings)
-            size = 0.0  # of doors, whose openings say it
+            size, width = 0.0, 1.0  # of doors, whose openings say it
             if isinstance(kind, Disc):
                 size = checks.number(f"radius of {name}", kind.radius, 0, 100)
             elif isinstance(kind, Crate):
                 size = checks.number(f"side of {name}", kind.side, 0, 100) / 2
+                if kind.width is not None and kind.width != kind.side:
+                    width = checks.number(f"width of {name}", kind.width, 0, kind.side) / kind.side
+            moves = checks.flag(f"movable of {name}", getattr(kind, "movable", False))
+            if moves and not isinstance(kind, Door):
+                checks.number(f"mass of {name}", kind.mass, 0, MAX_MASS, "kg")
+                if kind.friction != 0:
+                    checks.number(f"friction of {name}", kind.friction, 0, MAX_FRICTION)
             slots[name] = slice(len(shapes), len(shapes) + count)
             shapes += [type(kind).__name__.lower()] * count
             sizes += [size] * count
-            solid += [getattr(kind, "solid", True)] * count
+            widths += [width] * count
+            solid += [moves or getattr(kind, "solid", True)] * count
+            movable += [moves] * count
             names += [f"{name} {k}" for k in range(count)]
-        self.all = engine.Objects(core.n_envs, shapes, _palette(colours), lit, names, core.device)
+        of_all = core.n_envs, shapes, _palette(colours), lit, names, core.device
+        self.all = engine.Objects(*of_all, widths, movable, force, grip)
         self.all.sizes.copy_(torch.tensor(sizes))
         self.all.solid.copy_(torch.tensor(solid))
         core.scenery.objects = self.all
@@ -130,170 +151,28 @@ class Objects:
         seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         self.seed = derived_seed(seed, "objects")
         n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
-        loose = [size * 2**0.5 if shape == "crate" else size for shape, size in zip(shapes, sizes)]
+        loose = [
+            size * math.hypot(1, width) if shape == "crate" else size
+            for shape, size, width in zip(shapes, sizes, widths)
+        ]
         radius = max(core.agents.radius, *loose)
         points = cached_points(geometries, n_points, 1, radius, self.seed)
         self.points = torch.as_tensor(points, device=core.device)
         self.counts = torch.zeros_like(self.all.carriers)
         self._mask = torch.zeros_like(self.all.carriers, dtype=torch.bool)
-        self.kinds = {
-            name: Doors(self, name, slots[name], openings)
-            if isinstance(kind, Door)
-            else Kind(self, name, slots[name])
-            for name, kind in kinds.items()
-        }
+        self.kinds: dict[str, Kind] = {}
+        for name, kind in kinds.items():
+            if isinstance(kind, Door):
+                self.kinds[name] = Doors(self, name, slots[name], openings)
+            elif getattr(kind, "movable", False):
+                self.kinds[name] = Movable(self, name, slots[name])
+                self.kinds[name].masses.fill_(kind.mass)
+                self.kinds[name].frictions.fill_(kind.friction)
+            else:
+                self.kinds[name] = Kind(self, name, slots[name])
 
-    def __getitem__(self, name: str) -> "Kind":
+    def __getitem__(self, name: str) -> Any:
         return self.kinds[name]
-
-
-class Kind:
-    """The objects of one kind. Its tensors are views of the engine's: write into them in place.
-
-    Attributes:
-        positions: (N, K, 2) metres; of a carried object, its carrier's.
-        angles: (N, K) degrees.
-        sizes: (N, K) metres.
-        colours: (N, K) int32, indices into the colours.
-        visible, solid, open: (N, K) bool. An open object is as if it were not there.
-        carriers: (N, K) int32, the agent that carries it, or -1.
-        slots: the kind's objects among all of an environment.
-    """
-
-    def __init__(self, objects: Objects, name: str, slots: slice):
-        self._objects, self.name, self.slots = objects, name, slots
-        self._agents = torch.arange(objects.core.n_agents, device=objects.core.device)
-
-    def __len__(self) -> int:
-        return self.slots.stop - self.slots.start
-
-    def __getattr__(self, name: str) -> torch.Tensor:
-        if name not in TENSORS:
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-        return getattr(self._objects.all, name)[:, self.slots]
-
-    def place(self, mask: torch.Tensor, colours: torch.Tensor | int | None = None) -> None:
-        """Puts objects at random points in rooms, on no agent and no other object.
-
-        Call it after the spawner: points are of the layout that an environment shows.
-
-        Args:
-            mask: (N,) or (N, K) bool.
-            colours: (N, K) or (K,) integers, or one; their new colours. Default: they keep theirs.
-        """
-        mask, objects = self._broadcast(mask), self._objects
-        self._paint(mask, colours)
-        objects._mask.zero_()
-        objects._mask[:, self.slots] = mask
-        core, points = objects.core, (objects.points, objects.counts)
-        engine.place_objects(core.scenery, core.agents, objects._mask, *points, objects.seed)
-
-    def remove(self, mask: torch.Tensor) -> None:
-        """Has objects vanish where ``mask``, (N,) or (N, K) bool, is True."""
-        mask = self._broadcast(mask)
-        self.visible.logical_and_(~mask)
-        self.carriers.masked_fill_(mask, -1)
-
-    def touching(self, reach: float = REACH) -> torch.Tensor:
-        """Returns (N, A, K) bool: which agents are within ``reach`` metres of which objects'
-        edges. Nobody touches an object that is not there, or is carried.
-        """
-        agents, objects = self._objects.core.agents, self._objects.all
-        offset = agents.positions[:, :, None] - self.positions[:, None]
-        angle = torch.deg2rad(self.angles)[:, None]
-        sine, cosine = angle.sin(), angle.cos()
-        ahead = (cosine * offset[..., 0] + sine * offset[..., 1]).abs()
-        aside = (cosine * offset[..., 1] - sine * offset[..., 0]).abs()
-        shapes, sizes = objects.shapes[self.slots], self.sizes[:, None]
-        is_disc, is_crate = shapes == _DISC, shapes == _CRATE
-        ahead = (ahead - sizes * ~is_disc).clamp(min=0)
-        aside = (aside - sizes * is_crate).clamp(min=0)
-        limit = agents.radius + reach + sizes * is_disc
-        return (ahead.square() + aside.square() <= limit.square()) & self._loose()[:, None]
-
-    def looked_at(self, centre_line: torch.Tensor) -> torch.Tensor:
-        """Returns (N, A, K) bool: which objects are at the centre of which agents' screens, by
-        ``centre_line``, (N, A) or (N, A, C) int32, of :func:`megastep.engine.observe`.
-        """
-        core, n_agent_lines = self._objects.core, self._objects.core.scenery.agent_lines.shape[1]
-        objects = self._objects.all.at_lines(centre_line, n_agent_lines)
-        objects = objects.view(core.n_envs, core.n_agents, -1, 1)
-        own = torch.arange(self.slots.start, self.slots.stop, device=core.device)
-        return (objects == own).any(2)
-
-    def carry(self, mask: torch.Tensor) -> None:
-        """Has agents pick up objects where ``mask``, (N, A, K) bool, is True. If several want one,
-        the first has it. Nobody picks up what is not there, or carried.
-        """
-        taken = mask.any(1) & self._loose()
-        self.carriers.copy_(torch.where(taken, mask.int().argmax(1).int(), self.carriers))
-
-    def carried(self) -> torch.Tensor:
-        """Returns (N, A, K) bool: which agents carry which objects."""
-        return self.carriers[:, None] == self._agents[:, None]
-
-    def drop(self, mask: torch.Tensor) -> None:
-        """Has agents put down, where they are, what they carry, where ``mask``, (N, A) or (N, A, K)
-        bool, is True.
-        """
-        mask = mask if mask.ndim == 3 else mask[..., None]
-        self.carriers.masked_fill_((self.carried() & mask).any(1), -1)
-
-    def _loose(self) -> torch.Tensor:
-        return self.visible & ~self.open & (self.carriers < 0)
-
-    def _broadcast(self, mask) -> torch.Tensor:
-        n, k = self.visible.shape
-        is_mask = isinstance(mask, torch.Tensor) and mask.dtype == torch.bool
-        if not is_mask or mask.shape not in ((n,), (n, 1), (n, k)):
-            raise ValueError(
-                f"mask must be a bool tensor of shape ({n},) or ({n}, {k}), one per environment or "
-                f"per {self.name}"
-            )
-        return mask.view(n, -1).expand(n, k)
-
-    def _paint(self, mask, colours) -> None:
-        if isinstance(colours, int):
-            self.colours.masked_fill_(mask, colours)
-        elif colours is not None:
-            self.colours.copy_(torch.where(mask, colours.to(self.colours), self.colours))
-
-
-class Doors(Kind):
-    """The doors of homes: a :class:`Kind` whose objects each close a doorway.
-
-    Attributes:
-        n_doorways: (D,) int64, doors that each layout has.
-        poses: (D, K, 4) float32, of each: x and y in metres, angle in degrees, half the length.
-    """
-
-    def __init__(self, objects: Objects, name: str, slots: slice, openings: RaggedNumpy):
-        super().__init__(objects, name, slots)
-        shape, device = (len(openings), len(self)), self.positions.device
-        poses = np.zeros((*shape, 4), np.float32)
-        for d in range(len(openings)):
-            a, b = np.asarray(openings[d], float)[: len(self)].swapaxes(0, 1)
-            along = b - a
-            poses[d, : len(a), :2] = (a + b) / 2
-            poses[d, : len(a), 2] = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
-            poses[d, : len(a), 3] = np.hypot(*along.T) / 2 + _INTO_WALL
-        self.poses = torch.as_tensor(poses, device=device)
-        self.n_doorways = torch.as_tensor(openings.widths, device=device).clamp(max=len(self))
-
-    def place(self, mask: torch.Tensor, colours: torch.Tensor | int | None = None) -> None:
-        """Puts a shut door into each doorway of the layout that an environment shows. Arguments as
-        of :meth:`Kind.place`.
-        """
-        mask = self._broadcast(mask)
-        self._paint(mask, colours)
-        layout = self._objects.core.scenery.layout.long()
-        poses = self.poses[layout]
-        self.positions.copy_(torch.where(mask[..., None], poses[..., :2], self.positions))
-        self.angles.copy_(torch.where(mask, poses[..., 2], self.angles))
-        self.sizes.copy_(torch.where(mask, poses[..., 3], self.sizes))
-        exists = torch.arange(len(self), device=layout.device) < self.n_doorways[layout][:, None]
-        self.visible.copy_(torch.where(mask, exists, self.visible))
-        self.open.logical_and_(~mask)
 
 
 def _count(name, kind, openings) -> int:

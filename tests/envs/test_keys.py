@@ -10,7 +10,7 @@ from megastep import envs, toys
 from megastep.arrdict import arrdict
 from megastep.envs.keys.episodes import OPEN, Areas, _doors, cached_episodes, episodes
 from megastep.geometries import sample
-from megastep.modules.objects import REACH
+from megastep.modules.kinds import REACH
 from tests.helpers import keys_twin
 from tests.helpers.outputs import Poison
 

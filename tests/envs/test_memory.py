@@ -9,7 +9,7 @@ from megastep.arrdict import arrdict
 from megastep.envs.first_person import images
 from megastep.envs.memory import arrangements
 from megastep.geometries import sample
-from megastep.modules.objects import REACH
+from megastep.modules.kinds import REACH
 from tests.helpers import memory_twin
 from tests.helpers.outputs import Poison
 

@@ -1,4 +1,4 @@
-"""Worlds of agents and movable objects, and how far hulls overlap, from their corners, in float64."""
+"""Worlds of agents and movable objects, and how far they overlap, in float64."""
 
 import torch
 

@@ -15,8 +15,8 @@ from megastep.envs.common import Weight, judged, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.envs.keys.episodes import cached_episodes
 from megastep.kernels.build.kernel_library import KernelLibrary
+from megastep.modules.kinds import REACH
 from megastep.modules.lifecycle import derived_seed
-from megastep.modules.objects import REACH
 from megastep.settings import checked
 
 if TYPE_CHECKING:

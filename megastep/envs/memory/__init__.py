@@ -15,8 +15,8 @@ from megastep.engine.launch_params import object_params, seed_params
 from megastep.envs.common import judged, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.kernels.build.kernel_library import KernelLibrary
+from megastep.modules.kinds import REACH
 from megastep.modules.lifecycle import derived_seed
-from megastep.modules.objects import REACH
 from megastep.modules.spawning import CLEARANCE, candidates, distances, per_geometry
 from megastep.settings import checked
 

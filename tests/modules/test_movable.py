@@ -1,0 +1,171 @@
+"""Movable objects as an environment's author uses them: pushed, grabbed, locked."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from megastep import engine, modules, scene, toys
+from megastep.core import Core
+from megastep.modules import Crate, Disc, Objects
+
+PAGE = Path(__file__).parents[2] / "docs/objects.md"
+AHEAD, TURN_LEFT, STAND = 3, 5, 0
+
+
+def room(kinds, n_envs=2, n_agents=1, device="cpu", **arguments):
+    """Agents at (2, 3) that look along x, in a room of 5 m, and objects that are placed nowhere."""
+    plans = [toys.box()]
+    core = Core(scene.scenery(plans, n_agents, n_envs, device=device))
+    objects = Objects(plans, core, kinds, **arguments)
+    core.agents.positions.copy_(torch.tensor([2.0, 3.0]))
+    core.agents.positions[..., 1] += 0.5 * torch.arange(n_agents, device=device)
+    movement = modules.SimpleMovement(core, speed=1.0, ang_speed=45.0)
+    return (
+        core,
+        objects,
+        lambda *actions: movement({"actions": torch.tensor([actions] * n_envs, device=device)}),
+    )
+
+
+def put(kind, *at):
+    kind.visible.fill_(True)
+    kind.positions.copy_(torch.tensor([at], device=kind.positions.device))
+
+
+def test_the_example_of_the_page_brings_every_ball_into_the_goal(capsys):
+    section = PAGE.read_text().split("## Something to push")[1]
+    exec(re.search(r"```python\n(.*?)```", section, re.S)[1], {})
+    assert capsys.readouterr().out == "100% of the balls are in the goal\n"
+
+
+def test_what_is_grabbed_goes_and_turns_with_its_holder_until_released(device):
+    core, objects, act = room({"box": Crate(2, 0.3, movable=True)}, device=device)
+    boxes = objects["box"]
+    put(boxes, (2.35, 3.0), (5.0, 5.0))
+    boxes.grab(boxes.touching(0.1))
+    assert boxes.held().tolist() == [[[True, False]]] * 2
+    for _ in range(20):
+        act(TURN_LEFT)  # by 90 degrees in all
+    torch.testing.assert_close(
+        boxes.positions[:, 0].cpu(), torch.tensor([[2, 3.35]] * 2), rtol=0, atol=0.05
+    )
+    torch.testing.assert_close(boxes.angles[:, 0].cpu(), torch.full((2,), 90.0), rtol=0, atol=3)
+    for _ in range(10):
+        act(4)  # back, away from the box
+    assert (boxes.positions[:, 0, 1] < 2.7).all()
+    boxes.release(torch.ones((2, 1), dtype=torch.bool, device=device))
+    at = boxes.positions[:, 0, 1].clone()
+    for _ in range(5):
+        act(4)
+    assert (at - boxes.positions[:, 0, 1] < 0.2).all() and (boxes.holders == -1).all()
+
+
+def test_an_agent_loses_what_is_stuck_and_what_is_put_elsewhere():
+    core, objects, act = room(
+        {"box": Crate(1, 0.3, movable=True), "post": Disc(1, solid=True)}, grip=8.0
+    )
+    box, post = objects["box"], objects["post"]
+    put(box, (2.35, 3.0))
+    put(post, (2.1, 3.35))
+    box.grab(box.touching(0.1))
+    for _ in range(40):  # the post stops the box from turning with its holder
+        act(TURN_LEFT)
+    assert (box.holders == -1).all()
+    box.grab(torch.ones((2, 1, 1), dtype=torch.bool))
+    act(STAND)
+    box.positions[0] += 1
+    act(STAND)
+    assert box.holders.tolist() == [[-1], [0]]
+    spawner = modules.RandomSpawns([toys.box()], core)
+    spawner(torch.ones(2, dtype=torch.bool))
+    assert (box.holders == -1).all(), "who respawns lets go"
+
+
+def test_nobody_moves_what_is_locked_and_its_team_alone_unlocks_it(device):
+    core, objects, act = room({"box": Crate(1, 0.3, movable=True)}, device=device)
+    box, everywhere = objects["box"], torch.ones(2, dtype=torch.bool, device=device)
+    put(box, (2.35, 3.0))
+    box.grab(box.touching(0.1))
+    box.lock(everywhere, team=1)
+    box.lock(everywhere, team=0)  # too late
+    assert (box.owners == 1).all() and (box.holders == -1).all()
+    box.grab(box.touching(0.1))
+    before = box.positions.clone()
+    for _ in range(10):
+        progress = act(AHEAD).progress
+    assert torch.equal(before, box.positions) and (progress < 0.1).all()
+    assert (box.holders == -1).all(), "nor grabs it"
+    box.unlock(everywhere, team=0)
+    assert box.locked.all()
+    box.unlock(everywhere, team=1)
+    for _ in range(10):
+        act(AHEAD)
+    assert (box.positions[..., 0] > 2.6).all() and (box.owners == -1).all()
+    box.movable.fill_(False)
+    before = box.positions.clone()
+    for _ in range(10):
+        act(AHEAD)
+    assert torch.equal(before, box.positions)
+
+
+def test_placed_objects_rest_and_keep_clear_corners_included():
+    kinds = {"box": Crate(4, 0.6, movable=True, width=0.2), "ball": Disc(2, 0.2, movable=True)}
+    core, objects, act = room(kinds, n_envs=64)
+    everywhere = torch.ones(64, dtype=torch.bool)
+    for kind in objects.kinds.values():
+        kind.velocity.fill_(1)
+        kind.holders.fill_(0)
+        kind.locked.fill_(True)
+        kind.place(everywhere)
+        assert not kind.velocity.any() and (kind.holders == -1).all() and not kind.locked.any()
+    positions = objects.all.positions
+    radii = torch.tensor([0.1**0.5] * 4 + [0.2] * 2)
+    apart = torch.cdist(positions, positions) + 9 * torch.eye(6)
+    assert (apart > radii + radii[:, None]).all()
+    assert objects["box"].masses.eq(1).all() and objects.all.widths[0].item() == pytest.approx(
+        1 / 3
+    )
+
+
+def test_cameras_see_an_elongated_box_where_it_was_pushed():
+    core, objects, act = room({"box": Crate(1, 1.0, movable=True, width=0.2)}, n_envs=1)
+    box = objects["box"]
+    put(box, (2.5, 3.0))
+    box.angles.fill_(90)  # across
+    for _ in range(10):
+        act(AHEAD)
+        view = engine.render(core.scenery, core.agents)
+        middle = view.distances[0, 0, view.distances.shape[-1] // 2]
+        front = box.positions[0, 0, 0] - 0.1 - core.agents.positions[0, 0, 0]
+        assert middle.item() == pytest.approx(front.item(), abs=5e-3)
+    assert box.positions[0, 0, 0] > 2.8
+    assert box.touching(0.05).all() and not box.touching(0.001).all()
+
+
+@pytest.mark.parametrize(
+    "kinds, message",
+    [
+        ({"box": Crate(17, 0.1, movable=True)}, "at most 16 movable objects, but 17"),
+        ({"box": Crate(1, movable=True, mass=1e39)}, "mass of box must be a number of kg between"),
+        ({"box": Crate(1, movable=True, mass=0)}, "mass of box must be a number of kg between"),
+        ({"box": Crate(1, movable=True, friction=-1)}, "friction of box must be a number between"),
+        ({"box": Crate(1, 30.0, movable=True, width=1.0)}, "no point in a room"),
+        ({"box": Crate(1, 1.0, width=2.0)}, "width of box must be a number between 0 and 1"),
+    ],
+)
+def test_bad_kinds_are_named(kinds, message):
+    with pytest.raises(ValueError, match=message):
+        room(kinds)
+
+
+def test_bad_calls_are_named():
+    core, objects, act = room({"box": Crate(16, 0.1, movable=True)}, n_agents=17)
+    with pytest.raises(ValueError, match="at most 32 agents and movable objects together"):
+        act(*[STAND] * 17)
+    _, objects, _ = room({"key": 1})
+    with pytest.raises(AttributeError, match="key has no attribute 'masses' .only kinds with"):
+        _ = objects["key"].masses
+    with pytest.raises(ValueError, match="force must be a number of newtons"):
+        room({"box": Crate(1, movable=True)}, force=-1.0)
