@@ -656,6 +656,8 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
     if (top == 0.f) {  // all rest
         for (int a = group.rank; a < n_agents; a += Group::SIZE)
             p.progress[env * n_agents + a] = 1.f;
+        for (int k = group.rank; k < n_slots - n_agents; k += Group::SIZE)
+            bodies_of(p.objects)[env * p.objects.n_bodies + k].holder = b.holders[n_agents + k];
         return;
     }
     float limit = top + MIN_LIMIT, h = p.seconds * (1.f / SUBSTEPS);

@@ -76,7 +76,7 @@ def test_cpu_and_gpu_agree_on_every_bit(source):
     "source, n_envs, n_steps",
     [
         ("box", 16, 60),
-        pytest.param("homes", 8, 30, marks=pytest.mark.slow),
+        pytest.param("homes", 32, 60, marks=pytest.mark.slow),
         pytest.param("box", 1000, 700, marks=pytest.mark.nightly),
         pytest.param("homes", 500, 600, marks=pytest.mark.nightly),
     ],
@@ -89,7 +89,7 @@ def test_nothing_overlaps_by_more_than_the_slop(source, n_envs, n_steps):
         n_moved += int((o.velocity != 0).any())
         if i % 50 == 20:
             hold_some(scenery, agents, random)
-    assert worst <= 0.005 + 1e-5 and n_moved > n_steps / 2
+    assert worst <= 0.005 + 1e-5 and n_moved > n_steps / 4
     extents = scenery.layouts.extents.view(-1, 4)[scenery.layout.long()][:, None]
     assert ((o.positions > extents[..., :2]) & (o.positions < extents[..., 2:])).all()
 
