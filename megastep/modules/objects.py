@@ -164,7 +164,7 @@ class Objects:
         for name, kind in kinds.items():
             if isinstance(kind, Door):
                 self.kinds[name] = Doors(self, name, slots[name], openings)
-            elif getattr(kind, "movable", False):
+            elif isinstance(kind, (Disc, Crate)) and kind.movable:
                 self.kinds[name] = Movable(self, name, slots[name])
                 self.kinds[name].masses.fill_(kind.mass)
                 self.kinds[name].frictions.fill_(kind.friction)
