@@ -25,7 +25,7 @@ from megastep.web.page import SHIPPED
 LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MINATAR, MINIGRID, MEMORY, KEYS, POLICY
 #: Operations of setting up, of scripted bots and of robots, which no page launches.
 ABSENT = {
-    *("bake", "place_objects", "uniform", "bot", "scan"),
+    *("bake", "place_objects", "physics_bodies", "uniform", "bot", "scan"),
 }
 
 

@@ -670,8 +670,23 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
             b.velocity.x[i] = b.velocity.y[i] = 0.f;
         }
     sync(group);
-    find_touches(p, group, b, env, n_candidates, reach, 0, n_touches);
-    for (int substep = 0; substep < SUBSTEPS; substep++) {
+    for (int substep = 0, checks = 0;;) {
+        int is_bad = find_touches(p, group, b, env, n_candidates, reach, checks, n_touches);
+        if (checks && is_bad) {  // shifts were not enough
+            for (int i = group.rank; i < n_slots; i += Group::SIZE)
+                take_back(b, i, n_agents);
+            sync(group);
+            continue;
+        }
+        if (is_bad && !checks && substep > 0) {
+            end_overlaps(p, group, b, n_touches);
+            checks = 1;
+            continue;
+        }
+        if (substep == SUBSTEPS)
+            break;
+        substep++;
+        checks = 0;
         for (int i = group.rank; i < n_slots; i += Group::SIZE)
             begin_substep(b, i, n_agents);
         sync(group);
@@ -679,14 +694,6 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
         for (int i = group.rank; i < n_slots; i += Group::SIZE)
             displace(b, i, b.velocity, h, limit);
         sync(group);
-        if (find_touches(p, group, b, env, n_candidates, reach, 0, n_touches)) {
-            end_overlaps(p, group, b, n_touches);
-            while (find_touches(p, group, b, env, n_candidates, reach, 1, n_touches)) {
-                for (int i = group.rank; i < n_slots; i += Group::SIZE)
-                    take_back(b, i, n_agents);
-                sync(group);
-            }
-        }
     }
     for (int i = group.rank; i < n_slots; i += Group::SIZE)
         if (i < n_agents)
