@@ -22,7 +22,7 @@ def test_replay_is_the_environment(name):
     replay, generator, n_ended = Replay(program), torch.Generator().manual_seed(2), 0
     replay.run("reset")
     world = env.reset()
-    for t in range(800 if isinstance(env, envs.Explorer) else 150):
+    for t in range(800 if isinstance(env, (envs.Explorer, envs.MiniGrid)) else 150):
         leaves = spaces.leaves(world)
         for path, leaf in replay.world().items():
             assert torch.equal(leaf, leaves[path]), f"{path} in step {t}"
