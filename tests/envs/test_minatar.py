@@ -152,9 +152,9 @@ def test_breakout_in_any_state_equals_the_original():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("game", ["seaquest", "space_invaders"])
+@pytest.mark.parametrize("game", ["asterix", "seaquest", "space_invaders"])
 def test_equals_the_original_when_played_well(game):
-    play(game, n_envs=16, n_episodes=1, seed=3, n_plans=2, limit=100)
+    play(game, n_envs=8, n_episodes=1, seed=3, n_plans=2, limit=400)
 
 
 @pytest.mark.nightly
