@@ -20,7 +20,7 @@ CONCEPTS = ["../performance.md"] + sorted(
     if "```python" in page.read_text()
 )
 #: Pages that take more than about three seconds on an idle core.
-LONG = {"deathmatch.md", "explorer.md", "from-python.md", "keys-and-memory.md"}
+LONG = {"deathmatch.md", "egomotion.md", "explorer.md", "from-python.md", "keys-and-memory.md"}
 LONG |= {
     "own-floor-plans.md",
     "scaling-out.md",
