@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import core, engine, scene, toys
+from megastep import cache, core, engine, scene, toys
+from megastep.engine import operations
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.ragged import Ragged
 from tests.helpers import random_scenery
@@ -211,3 +212,13 @@ def test_environments_are_spread_over_all_geometries(n_geometries, n_envs, layou
     made = scene.scenery(geometries, n_envs=n_envs, device="cpu")
     assert made.layout.tolist() == layouts
     assert scene.spread(range(n_geometries), n_envs) == sorted(set(layouts))
+
+
+def test_light_from_the_cache_has_the_same_bits(tmp_path, monkeypatch):
+    baked = scene.scenery([toys.box(), toys.column()], device="cpu").layouts.texels
+    monkeypatch.setattr(cache, "_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(operations, "MIN_CACHED", 1)
+    for bake in (operations.bake, None):  # the second time nothing is computed
+        monkeypatch.setattr(operations, "bake", bake)
+        scenery = scene.scenery([toys.box(), toys.column()], device="cpu")
+        assert scenery.layouts.texels.equal(baked) and not baked[:, 3].eq(1).all()

@@ -12,22 +12,6 @@ from megastep.agents.training import episode_stats
 from megastep.agents.training.episode_stats import N_INTERVALS, EpisodeStats, lane_groups
 
 
-def slow_episodes(reward, reset, done, partial):
-    """Returns (return, length) of each finished episode. Updates `partial`, the return and length
-    so far of each lane's current episode.
-    """
-    finished = []
-    for t in range(len(reward)):
-        for lane in range(reward.shape[1]):
-            total, length = partial[lane]
-            total, length = total + float(reward[t, lane]), length + (not reset[t, lane])
-            if done[t, lane]:
-                finished.append((total, length))
-                total, length = 0.0, 0
-            partial[lane] = total, length
-    return finished
-
-
 def popped(episodes):
     """Returns the statistics of all episodes that have ended, as if no other were running."""
     episodes.is_whole[:] = False
@@ -39,31 +23,6 @@ def popped(episodes):
 def named(stats, group=""):
     """Returns the statistics of all episodes, or of a group's, as they are logged."""
     return {f"episode/{name}{group}": value for name, value in stats.items()}
-
-
-def test_episodes_across_rollouts_match_slow_count():
-    torch.manual_seed(1)
-    n_lanes, episodes, finished = 5, EpisodeStats(5, "cpu"), []
-    partial = {lane: (0.0, 0) for lane in range(n_lanes)}
-    ended = torch.zeros(n_lanes, dtype=torch.bool)
-    for _ in range(6):
-        done = torch.rand(7, n_lanes) < 0.2
-        reset = torch.cat([ended[None], done[:-1]])
-        done &= ~reset  # an episode cannot end on its first observation
-        reset = torch.cat([ended[None], done[:-1]])
-        ended = done[-1]
-        reward = torch.rand(7, n_lanes) * ~reset
-        episodes.add(reward, reset, done)
-        finished += slow_episodes(reward, reset, done, partial)
-    stats = popped(episodes)
-    returns = torch.tensor([total for total, _ in finished])
-    assert stats["episode/count"] == len(finished) > 20
-    assert stats["episode/return"] == pytest.approx(float(returns.mean()), rel=1e-6)
-    assert stats["episode/return_std"] == pytest.approx(float(returns.std(correction=0)), rel=1e-5)
-    mean_length = sum(length for _, length in finished) / len(finished)
-    assert stats["episode/length"] == pytest.approx(mean_length)
-    totals = [partial[lane][0] for lane in range(n_lanes)]
-    assert episodes.totals[0].tolist() == pytest.approx(totals, rel=1e-6)
 
 
 @pytest.mark.parametrize("bad", [torch.nan, 1e30])
