@@ -13,8 +13,6 @@ with contextlib.redirect_stdout(io.StringIO()):  # it says which windows it cann
 from irsim.lib.path_planners.jps import JPSPlanner
 from irsim.world.map import Map
 
-SUBSTEPS = 2  # of its kinematics, which go straight during a step
-
 
 class InIrsim:
     """Args: robot: the description's. steps_per_second: of the policy."""
@@ -22,7 +20,7 @@ class InIrsim:
     name = "irsim"
 
     def __init__(self, robot, steps_per_second):
-        self.robot, self.step_time = robot, 1 / steps_per_second / SUBSTEPS
+        self.robot, self.step_time = robot, 1 / steps_per_second
 
     def begin(self, episode):
         """Makes a world with the walls and the robot at the start of an episode."""
@@ -84,11 +82,8 @@ class InIrsim:
 
     def drive(self, command):
         """Drives for one step of the policy. Returns whether the robot touched a wall."""
-        touches = False
-        for _ in range(SUBSTEPS):
-            self.env.step(np.asarray(command, float).reshape(2, 1))
-            touches |= bool(self.body.contact.reports)
-        return touches
+        self.env.step(np.asarray(command, float).reshape(2, 1))
+        return bool(self.body.contact.reports)
 
     def messages(self):
         """Returns its LaserScan and Odometry, as dicts in the form of ROS."""
@@ -96,7 +91,7 @@ class InIrsim:
         return message.scan.to_dict(), message.odom.to_dict()
 
 
-def polylines(walls, most=5):
+def polylines(walls, most=9):
     """Returns walls (W, 2, 2) as lines through a few points each, [[x, y], ...], which it handles
     faster.
     """
