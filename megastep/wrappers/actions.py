@@ -94,7 +94,7 @@ class NoisyActions(_Random):
         leaves = [*spaces.leaves(env.action_space).values()]
         #: Bounds of continuous actions, made once: a step copies nothing to the device.
         self.bounds = [
-            space.tensors(env.device) if isinstance(space, spaces.MultiContinuous) else ()
+            space.tensors(env.device) if isinstance(space, spaces.MultiContinuous) else None
             for space in leaves
         ]
         self.draws = [Draws(env, space.shape, seed + (i << 40)) for i, space in enumerate(leaves)]
@@ -111,7 +111,7 @@ class NoisyActions(_Random):
                 others = (numbers[..., 1] * n).to(leaf.dtype).clamp(max=n - 1)
                 is_random = numbers[..., 0] < along(self.probability * levels, leaf)
                 return torch.where(is_random, others, leaf)
-            low, high = bounds
+            low, high = cast(Any, bounds)
             noise = along(self.std * levels, leaf) * ((high - low) * 0.5) * normal(numbers)
             return torch.minimum(torch.maximum(leaf + noise, low), high)
 

@@ -168,7 +168,7 @@ class PointGoal(FirstPerson):
         if self.robot is None:
             return {}
         robot, limits = dataclasses.asdict(self.robot), [self.robot.speed, self.robot.turn_rate]
-        sensors = {
+        sensors: dict[str, Any] = {
             "goal": ["distance / 10 m", "cosine of the bearing", "sine of the bearing"],
             "odom": [f"speed ahead / {limits[0]:g} m/s", f"turning left / {limits[1]:g} rad/s"],
         }
