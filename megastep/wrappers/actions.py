@@ -1,7 +1,7 @@
 """Wrappers that change actions or the length of episodes."""
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import torch
 from pydantic import Field
