@@ -27,7 +27,7 @@ OUTCOMES = "reward", "terminal", "truncated"
 #: Names of what is no observation.
 RESERVED = "action", "mask", *OUTCOMES
 #: Names of floor plans, which all rows of an episode share.
-PLANS = "maze_layout", "walls"
+PLANS = "maze_layout", "maze_frame", "walls"
 Arrays = dict[str, np.ndarray]
 
 
@@ -207,7 +207,8 @@ def read(path: Path) -> Arrays:
 def with_plan(arrays: Arrays, home: Mapping[str, Any]) -> Arrays:
     """Returns an episode with its floor plan: `walls` (M, 2, 2), metres. In mazes of cells also
     `maze_layout` (T + 1, n, n), 1 where there is floor; places are in cells there, as those of
-    Memory Maze, and not in metres: (0, 0) is the corner of the first cell.
+    Memory Maze, and not in metres: (0, 0) is the corner of the first cell. `maze_frame` (3,) has
+    the corner's x and y and the side of a cell, in metres.
     """
     arrays = {**arrays, "walls": home["walls"]}
     if "floor" not in home:
@@ -218,4 +219,6 @@ def with_plan(arrays: Arrays, home: Mapping[str, Any]) -> Arrays:
         elif name.endswith("_vec"):
             arrays[name] = (array / home["cell"]).astype(np.float32)
     rows, floor = len(arrays["reward"]), home["floor"].astype(np.uint8)
-    return arrays | {"maze_layout": np.broadcast_to(floor, (rows, *floor.shape))}
+    frame = np.array([home["corner"], home["corner"], home["cell"]], np.float32)
+    layout = np.broadcast_to(floor, (rows, *floor.shape))
+    return arrays | {"maze_layout": layout, "maze_frame": frame}

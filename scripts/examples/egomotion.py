@@ -116,7 +116,8 @@ class Egomotion(BC):
         super().__init__(policy, **settings)
 
     def extra_parameters(self) -> Any:
-        self.head = QueryHead(self.policy.width, self.policy.obs_space["d"].W)
+        space: Any = self.policy.obs_space
+        self.head = QueryHead(self.policy.width, space["d"].W)
         return self.head.parameters()
 
     def extra_loss(
@@ -144,8 +145,8 @@ class Frozen(PPO):
 
     def __init__(self, policy: Policy, **settings: Any):
         super().__init__(policy, **settings)
-        for module in policy.intake, policy.core:
-            for parameter in module.parameters():
+        for name, parameter in policy.named_parameters():
+            if name.startswith(("intake.", "core.")):
                 parameter.register_hook(torch.zeros_like)
 
 
@@ -159,13 +160,13 @@ class Model:
         loaded = folders.load_checkpoint(folders.find(run), True, "cpu", is_whole=True)
         self.policy, self.name = restore.policy_of(loaded), run
         state: Any = loaded.state
-        self.head = QueryHead(self.policy.width, self.policy.obs_space["d"].W)
+        space: Any = self.policy.obs_space
+        self.head = QueryHead(self.policy.width, space["d"].W)
         for parameter, saved in zip(self.head.parameters(), state["learner"]["extra"]):
             parameter.data.copy_(saved)
         if untrained:
-            new = Policy(
-                self.policy.obs_space, self.policy.action_space, **self.policy.settings, seed=99
-            )
+            kinds: Any = self.policy.settings
+            new = Policy(self.policy.obs_space, self.policy.action_space, **kinds, seed=99)
             statistics = dict(self.policy.named_buffers())
             new.load_state_dict({**new.state_dict(), **statistics})
             self.policy, self.name = new, f"{run}, untrained"
@@ -186,8 +187,15 @@ class Model:
 
 def true_poses(one: arrdict) -> torch.Tensor:
     """Returns poses (T + 1, 3), metres and radians, from a dataset with truth=true."""
+    corner, cell = frame(one)
     x, y = one["agent_dir"].unbind(-1)
-    return torch.cat([one["agent_pos"], torch.atan2(y, x)[:, None]], -1)
+    return torch.cat([corner + cell * one["agent_pos"], torch.atan2(y, x)[:, None]], -1)
+
+
+def frame(one: arrdict) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the corner and the side, in metres, of the cells in which places of a maze are."""
+    numbers = one.get("maze_frame", torch.tensor([0.0, 0.0, 1.0]))
+    return numbers[:2], numbers[2]
 
 
 def raycast(walls: torch.Tensor, poses: torch.Tensor, n_pixels: int = 64) -> torch.Tensor:
@@ -279,7 +287,7 @@ def probe(model: Model, episodes: Sequence[arrdict], every: int = 5) -> dict[str
         since = torch.cat([since[:, :2], since[:, 2:].cos(), since[:, 2:].sin()], -1)
         target = [since, wall_cells(one, poses[rows]).float()]
         if "targets_vec" in one:
-            target.append(one["targets_vec"][rows].flatten(1))
+            target.append(frame(one)[1] * one["targets_vec"][rows].flatten(1))
         parts.append((model.features(one)[rows], torch.cat(target, 1)))
     half = len(parts) // 2
     (x, y), (x_test, y_test) = (

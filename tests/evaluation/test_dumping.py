@@ -66,6 +66,7 @@ def test_keys_and_shapes_are_those_of_memory_maze(mazes):
         "terminal": ((n,), "b"),
         "truncated": ((n,), "b"),
         "walls": ((len(arrays["walls"]), 2, 2), "f"),
+        "maze_frame": ((3,), "f"),
     }
     assert not arrays["action"][0].any() and (arrays["action"][1:].sum(1) == 1).all()
     assert arrays["truncated"].tolist() == [False] * 70 + [True]
@@ -86,8 +87,9 @@ def test_truth_is_in_cells_of_the_maze(mazes):
         )
         distances = (one["targets_pos"] - one["target_pos"][:, None]).norm(dim=-1)
         assert (distances.min(1).values == 0).all()
-    lengths = (one["walls"][:, 1] - one["walls"][:, 0]).norm(dim=-1)
-    assert (lengths / 0.6 - (lengths / 0.6).round()).abs().max() < 1e-3, "walls are of whole cells"
+    corner, cell = one["maze_frame"][:2], one["maze_frame"][2]
+    ends = (one["walls"] - corner) / cell
+    assert (ends - ends.round()).abs().max() < 1e-3, "walls are along cells"
 
 
 def test_an_environment_repeats_the_episodes(few, tmp_path):
