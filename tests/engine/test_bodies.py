@@ -7,7 +7,7 @@ import torch
 from megastep import engine, scene
 from megastep.capture import state_tree
 from megastep.geometries import toys
-from tests.helpers import bodies
+from tests.helpers import bodies, bodies_twin
 from tests.helpers.cuda_on_cpu import ORDERS
 
 
@@ -243,3 +243,89 @@ def test_a_mirrored_world_moves_mirrored_for_100_steps():
     off = (ends[0] - ends[1]).abs().amax((0, 2, 3))
     print(off)
     assert off.max() < 1e-4
+
+
+def slots_of(scenery, agents, e, wish):
+    """Environment `e` for the twin: its agents and bodies, and what stands still."""
+    o, slots, fixed = scenery.objects, [], []
+    for a in range(agents.positions.shape[1]):
+        slots.append(
+            dict(
+                at=agents.positions[e, a].double().numpy(),
+                angle=float(agents.angles[e, a]),
+                radius=agents.radius * 1.001 + 0.005,
+                v=agents.velocity[e, a].double().numpy(),
+                w=np.radians(float(wish[1][e, a])),
+                wish=wish[0][e, a].double().numpy(),
+                **dict(m=1.0, i=0.0, limit=20.0, is_agent=True),
+            )
+        )
+    for k in range(o.n_objects):
+        size, width = float(o.sizes[e, k]), float(o.widths[k])
+        s = dict(at=o.positions[e, k].double().numpy(), angle=float(o.angles[e, k]))
+        gyration2 = size**2 * ((1 + width**2) / 3)
+        if int(o.shapes[k]) == 0:
+            s["radius"], gyration2 = size, size**2 / 2
+        else:
+            s["half"] = np.array([size, size * width])
+        if k >= o.n_bodies:
+            fixed.append(s)
+            continue
+        mass, friction = float(o.masses[e, k]), float(o.frictions[e, k])
+        slots.append(
+            s
+            | dict(
+                v=o.velocity[e, k].double().numpy(),
+                w=np.radians(float(o.angvelocity[e, k])),
+                wish=np.zeros(2),
+                m=1 / mass,
+                i=1 / (mass * gyration2),
+                limit=friction * mass * 9.81,
+                is_agent=False,
+            )
+        )
+    walls = []
+    for a, b in scenery.layouts.lines[int(scenery.layout[e])].double().numpy():
+        half = np.array([np.linalg.norm(b - a) / 2, 0.0])
+        walls.append(dict(at=(a + b) / 2, angle=np.degrees(np.arctan2(*(b - a)[::-1])), half=half))
+    return slots, [*walls, *fixed]
+
+
+def test_a_step_is_the_twins():
+    """From states that come up in play. Rounding may decide which of two sides touches."""
+    n_envs, n_steps, off, moved = 10, 24, [], 0
+    scenery, agents, random = bodies.world(n_envs, "box", seed=7)
+    o = scenery.objects
+
+    def twin(actions):
+        turn, move = torch.deg2rad(agents.angles), bodies.MOVES[actions]
+        c, s = turn.cos(), turn.sin()
+        ahead = torch.stack(
+            [c * move[..., 0] - s * move[..., 1], s * move[..., 0] + c * move[..., 1]], -1
+        )
+        wish = 0.875 * agents.velocity + ahead, 0.875 * agents.angvelocity + move[..., 2]
+        ends = []
+        for e in range(n_envs):
+            slots, fixed = slots_of(scenery, agents, e, wish)
+            bodies_twin.step(slots, fixed, 0.1)
+            ends.append([np.array([*s["at"], s["angle"], *s["v"]]) for s in slots])
+        return torch.as_tensor(np.array(ends))
+
+    odds = torch.tensor([1.0, 1, 1, 8, 1, 2, 2, 3, 3]).expand(n_envs, -1)
+    for step in range(n_steps):
+        if step % 8 == 0:
+            actions = torch.multinomial(odds, 3, True, generator=random)
+        expected = twin(actions)
+        engine.physics(scenery, agents, actions, bodies.MOVES, 0.125)
+        at = torch.cat([agents.positions, o.positions[:, : o.n_bodies]], 1).double()
+        v = torch.cat([agents.velocity, o.velocity], 1).double()
+        angles = torch.cat([agents.angles, o.angles[:, : o.n_bodies]], 1).double()
+        turned = (angles - expected[..., 2] + 180) % 360 - 180
+        gap = torch.cat(
+            [at - expected[..., :2], 0.01 * turned[..., None], 0.1 * (v - expected[..., 3:])], -1
+        )
+        off.append(gap.abs().amax((1, 2)))
+        moved += int((o.velocity != 0).any((1, 2)).sum())
+    off = torch.stack(off)
+    assert moved > 30
+    assert (off < 1e-4).double().mean() > 0.99
