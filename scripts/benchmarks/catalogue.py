@@ -7,11 +7,24 @@ from collections.abc import Callable, Iterator
 
 from adapter_steps import adapters
 from engine_operations import agents, cpu, kernels, observe
-from env_steps import deathmatch, mazes, memory, objects, pong, step
+from env_steps import deathmatch, mazes, memory, objects, pong, pushing, step
 from populations import members, small_members
 from scaling import scaling
 from training import startup, train
 
-ALL = (step, objects, mazes, kernels, observe, agents, deathmatch, memory, adapters, pong, startup)
+ALL = (
+    step,
+    objects,
+    pushing,
+    mazes,
+    kernels,
+    observe,
+    agents,
+    deathmatch,
+    memory,
+    adapters,
+    pong,
+    startup,
+)
 ALL += (cpu, train, scaling, members, small_members)
 BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {one.__name__: one for one in ALL}

@@ -1,9 +1,12 @@
-"""Benchmarks of whole environments: `step`, `objects`, `mazes`, `deathmatch`, `pong`, `memory`."""
+"""Benchmarks of whole environments: `step`, `objects`, `pushing`, `mazes`, `deathmatch`, `pong`,
+`memory`.
+"""
 
 import itertools
 from collections.abc import Iterator
 
 import torch
+from pushing import KINDS, Pushing
 from random_walks import N_HOMES, random_actions, walk, walk_in_homes, walk_in_rollouts
 from timing import graph_seconds_per_call, lap_seconds, measurement, rate, seconds_per_call
 
@@ -42,7 +45,12 @@ def objects(device: torch.device) -> Iterator[dict]:
     """Frames per second of Explorer's `env.step`, without its metrics, in homes without objects and
     with six: solid crates of four lines, and discs of six that nobody bumps into.
     """
-    kinds = {"none": None, "six crates": modules.Crate(6, 0.2), "six discs": modules.Disc(6)}
+    kinds = {
+        "none": None,
+        "six crates": modules.Crate(6, 0.2),
+        "six movable crates": modules.Crate(6, 0.2, movable=True),
+        "six discs": modules.Disc(6),
+    }
     for n_envs in N_ENVS_WITH_OBJECTS[device.type]:
         homes = sample("bench", N_HOMES)
         for name, kind in kinds.items():
@@ -53,6 +61,18 @@ def objects(device: torch.device) -> Iterator[dict]:
             _, take_step = walk(env)
             what = f"explorer, `env.step`, {n_envs:,} environments, objects: {name}"
             yield rate(what, n_envs, seconds_per_call(take_step, device))
+
+
+def pushing(device: torch.device) -> Iterator[dict]:
+    """Agents' frames per second of a game of four agents that push nine boxes, and of the game
+    without boxes that can be pushed: physics, rendering, reward, resets, in PyTorch.
+    """
+    still = {name: kind._replace(movable=False) for name, kind in KINDS.items()}
+    for n_envs in N_ENVS_WITH_OBJECTS[device.type]:
+        for name, kinds in (("movable", KINDS), ("that stay", still)):
+            _, take_step = walk(Pushing(n_envs, device, kinds=kinds))
+            what = f"pushing, `env.step`, {n_envs:,} environments of 4 agents, 9 boxes {name}"
+            yield rate(what, 4 * n_envs, seconds_per_call(take_step, device))
 
 
 def mazes(device: torch.device) -> Iterator[dict]:

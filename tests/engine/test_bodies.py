@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from megastep import engine, scene
-from megastep.capture import state_tree
+from megastep.capture import capture, state_tree
 from megastep.geometries import toys
 from tests.helpers import bodies, bodies_twin
 from tests.helpers.cuda_on_cpu import ORDERS
@@ -329,3 +329,19 @@ def test_a_step_is_the_twins():
     off = torch.stack(off)
     assert moved > 30
     assert (off < 1e-4).double().mean() > 0.99
+
+
+@pytest.mark.cuda
+def test_a_captured_step_equals_one_that_is_not():
+    def run(is_captured):
+        scenery, agents, _ = bodies.world(8, "box", device="cuda")
+        actions = torch.full((8, 3), 3, device="cuda")
+        moves = bodies.MOVES.cuda()
+
+        def step():
+            return engine.physics(scenery, agents, actions, moves, 0.125).progress
+
+        replay = capture(step, (), (scenery, agents)) if is_captured else step
+        return [replay().clone() for _ in range(40)] + [scenery.objects.records.view(torch.int32)]
+
+    same_bits(run(False), run(True))
