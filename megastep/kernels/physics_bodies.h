@@ -55,7 +55,7 @@ struct Bodies {
     float load[MAX_BODIES], load_turn[MAX_BODIES];  // their sums over all substeps
     float extent[MAX_SLOTS], speeds[MAX_SLOTS];
     int exists[MAX_SLOTS], holders[MAX_SLOTS], hit[MAX_SLOTS];
-    int overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
+    int awake[MAX_SLOTS], overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
     int candidates[MAX_CANDIDATES];
     int touch_a[MAX_TOUCHES], touch_b[MAX_TOUCHES], levels[MAX_TOUCHES];
     Touch touches[MAX_TOUCHES];
@@ -197,6 +197,37 @@ HD int is_near(const ObjectsParams& o, const Bodies& b, int env, int a, int k, f
            ABS(object.y - b.hulls[a].y) <= apart;
 }
 
+// Returns 1 if two slots may touch while nothing moves further than `reach`.
+HD int may_touch(const Bodies& b, int a, int c, float reach) {
+    float apart = b.extent[a] + b.extent[c] + 2.f * reach;
+    return ABS(b.hulls[c].x - b.hulls[a].x) <= apart && ABS(b.hulls[c].y - b.hulls[a].y) <= apart;
+}
+
+// Leaves out slots that rest and that nothing may touch in this step: which nothing that moves may
+// reach, nor what that may push.
+template <class Group>
+HD void leave_out_sleepers(const Group& group, Bodies& b, int n_slots, float reach) {
+    for (int i = group.rank; i < n_slots; i += Group::SIZE)
+        b.awake[i] = b.speeds[i] > 0.f;
+    sync(group);
+    for (unsigned int any = 1; any;) {
+        any = 0;
+        for (int i = group.rank; i < n_slots; i += Group::SIZE) {
+            int wakes = 0;
+            for (int k = 0; k < n_slots && b.exists[i] && !b.awake[i] && !wakes; k++)
+                wakes = b.awake[k] && may_touch(b, i, k, reach);
+            if (wakes)
+                b.awake[i] = 1;
+            any |= wakes;
+        }
+        sync(group);
+        any = reduce_or(group, any);
+    }
+    for (int i = group.rank; i < n_slots; i += Group::SIZE)
+        b.exists[i] &= b.awake[i];
+    sync(group);
+}
+
 // Lists all pairs that may touch while nothing moves further than `reach`. Returns their number.
 template <class Group>
 HD int find_candidates(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int env,
@@ -211,11 +242,9 @@ HD int find_candidates(const PhysicsBodiesParams& p, const Group& group, Bodies&
         float apart = b.extent[a] + reach;
         for (int start = a + 1; start < n_slots; start += Group::SIZE) {
             int c = start + group.rank, has = c < n_slots;
-            if (has) {
-                float both = apart + b.extent[c] + reach;
+            if (has)
                 has = b.exists[c] && (b.inv_mass[a] > 0.f || b.inv_mass[c] > 0.f) &&
-                      ABS(b.hulls[c].x - hull.x) <= both && ABS(b.hulls[c].y - hull.y) <= both;
-            }
+                      may_touch(b, a, c, reach);
             add_candidate(group, b, has, a, SLOT, c, n);
         }
         if (b.inv_mass[a] == 0.f)
@@ -662,6 +691,7 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
     }
     float limit = top + MIN_LIMIT, h = p.seconds * (1.f / SUBSTEPS);
     float reach = limit * h + MAX_SHIFT;
+    leave_out_sleepers(group, b, n_slots, SUBSTEPS * reach);
     int n_candidates = find_candidates(p, group, b, env, SUBSTEPS * reach), n_touches;
     sync(group);
     for (int i = group.rank; i < n_slots; i += Group::SIZE)

@@ -1,5 +1,7 @@
 """Worlds of agents and movable objects, and how far they overlap, in float64."""
 
+import functools
+
 import torch
 
 from megastep import engine, scene
@@ -44,6 +46,16 @@ def world(n_envs, source="box", n_agents=3, device="cpu", seed=1, friction=0.5, 
     return scenery, agents, random
 
 
+@functools.lru_cache(maxsize=4)
+def walls_of(scenery):
+    """The walls of each environment, as :func:`corners` has them, the last one repeated."""
+    walls = [scenery.layouts.lines[int(d)].double().cpu() for d in scenery.layout]
+    most = max(map(len, walls))
+    walls = torch.stack([torch.cat([w, w[-1:].expand(most - len(w), 2, 2)]) for w in walls])
+    along = (walls[:, :, 1] - walls[:, :, 0]) / 2
+    return walls.mean(2), torch.stack([along, 0 * along], -2), 0 * along[..., 0]
+
+
 def corners(scenery, agents):
     """The discs and rectangles of each environment: centres (N, K, 2), axes (N, K, 2, 2) whose
     lengths are half those of the sides, and radii (N, K), 0 of rectangles, in float64.
@@ -54,11 +66,7 @@ def corners(scenery, agents):
     x = torch.stack([angles.cos(), angles.sin()], -1) * (sizes * ~is_disc)[..., None]
     y = torch.stack([-x[..., 1], x[..., 0]], -1) * o.widths.double().cpu()[:, None]
     bodies = o.positions.double().cpu(), torch.stack([x, y], -2), sizes * is_disc
-    walls = [scenery.layouts.lines[int(d)].double().cpu() for d in scenery.layout]
-    most = max(map(len, walls))
-    walls = torch.stack([torch.cat([w, w[-1:].expand(most - len(w), 2, 2)]) for w in walls])
-    along = (walls[:, :, 1] - walls[:, :, 0]) / 2
-    of_walls = walls.mean(2), torch.stack([along, 0 * along], -2), 0 * along[..., 0]
+    of_walls = walls_of(scenery)
     at = agents.positions.double().cpu()
     of_agents = at, torch.zeros(*at.shape, 2).double(), torch.full(at.shape[:2], agents.radius)
     return [torch.cat(parts, 1) for parts in zip(of_agents, bodies, of_walls)]
