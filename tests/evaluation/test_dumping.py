@@ -154,6 +154,16 @@ def test_a_stopped_dump_goes_on_to_the_same_bytes(few, tmp_path, monkeypatch):
     )
 
 
+def test_environments_of_others_repeat_their_waves(few, tmp_path):
+    """Those without seeded resets are made anew for each wave."""
+    words = "env=gymnasium", "env.id=CartPole-v1"
+    pair = [dumped(tmp_path / name, *words, n=6) for name in ("one", "other")]
+    assert contents(pair[0]) == contents(pair[1]) and len({*contents(pair[0]).values()}) == 6
+    for one in data.load(pair[0]):
+        assert one.obs.shape == (len(one.reward) + 1, 1, 4) and one.terminal[-1]
+        assert (one.reward == 1).all() and one.obs[-1].abs().max() > 0.2  # radians, or metres
+
+
 def test_a_trained_agent_plays_its_own_environment(few, tmp_path):
     words = "run=pointgoal_anywhere", "episodes=4", "device=cpu", "geometry=box", "greedy=true"
     assert dump.main([*words, f"folder={tmp_path / 'data'}"]) == 0
