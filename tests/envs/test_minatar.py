@@ -125,6 +125,10 @@ def test_equals_the_original_without_sticky_actions_and_ramping(game="asterix"):
     play(game, n_envs=8, n_episodes=1, seed=5, limit=300, sticky=0, ramping=False)
 
 
+def test_freeway_ends_by_itself():
+    assert play("freeway", n_envs=1, n_episodes=1, seed=2) == (1, 2501, 0)
+
+
 def test_breakout_in_any_state_equals_the_original():
     """Few games come to where a ball is between bricks."""
     n, random, original = 400, np.random.default_rng(1), imported("minatar.environment")
@@ -149,6 +153,42 @@ def test_breakout_in_any_state_equals_the_original():
             assert np.array_equal(world.obs[e, 0].permute(1, 2, 0).numpy(), theirs[e].state())
         alive &= ~world.terminal.numpy()
     assert alive.sum() > 20
+
+
+def test_seaquest_with_things_that_are_equal_equals_the_original():
+    """The original removes the first of equal things from lists that it walks backwards."""
+    n, random, original = 400, np.random.default_rng(1), imported("minatar.environment")
+    ours = envs.MinAtar(n, id="seaquest", sticky=0, seed=1, device="cpu")
+    ours.reset()
+    theirs = [original.Environment("seaquest", sticky_action_prob=0) for _ in range(n)]
+    # first rows of `lists`, things, and numbers of a thing
+    lists = dict(f_bullets=(0, 4, 3), divers=(4, 3, 4), e_bullets=(8, 8, 3))
+    lists |= dict(e_fish=(40, 16, 4), e_subs=(72, 16, 5))
+    for e, env in enumerate(theirs):
+        env.random = env.env.random = OurDraws(e, 1)
+        env.reset()
+        game, is_near = env.env, e % 2  # to the surface
+        game.sub_x, game.sub_y, game.surface = 8 if is_near else 5, 1 if is_near else 8, False
+        game.diver_count, game.move_speed, game.ramp_index = random.integers((0, 2, 0), (7, 5, 2))
+        state = game.sub_x, game.sub_y, game.diver_count, 0, game.move_speed, game.ramp_index
+        ours.games[[4, 5, 8, 9, 14, 15], e] = torch.tensor(state, dtype=torch.int32)
+        for k, (name, (first, size, width)) in enumerate(lists.items()):
+            things = random.integers(0, (4, 2, 2, 3, 11), (size, 5)) + (3, 2, 0, 0, 0)
+            things[:, width:] = 0
+            fields = things[:, :width].tolist()
+            setattr(game, name, [[x, y, bool(right), *more] for x, y, right, *more in fields])
+            packed = 2 + things @ (1, 16, 1 << 8, 1 << 12, 1 << 16)
+            ours.lists[first : first + size, e] = torch.from_numpy(packed).int()
+            ours.games[16 + k, e] = size
+    for _ in range(12):
+        actions = random.integers(5, size=(n, 1))
+        world = ours.step(arrdict(actions=torch.from_numpy(actions)))
+        for e, env in enumerate(theirs):
+            if not env.env.terminal:
+                reward, done = env.act(actions[e, 0])
+                assert (float(world.reward[e]), bool(world.terminal[e])) == (reward, done)
+                assert np.array_equal(world.obs[e, 0].permute(1, 2, 0).numpy(), env.state())
+    assert sum(not env.env.terminal for env in theirs) > 20
 
 
 @pytest.mark.slow
