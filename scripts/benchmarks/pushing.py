@@ -54,6 +54,7 @@ class Pushing(SceneryEnv):
         near = (self.objects.all.positions - self.middle).square().sum(-1) < 1
         view = engine.observe(self.core.scenery, self.core.agents, subsample=4, imu=True)
         lanes = self.n_envs * self.n_agents
+        assert view.rgb is not None and view.depth is not None and view.imu is not None
         tensors = dict(rgb=view.rgb, d=view.depth, imu=view.imu)
         return arrdict(
             obs={k: x.view(lanes, *self.obs_space[k].shape) for k, x in tensors.items()},
