@@ -295,9 +295,10 @@ def slots_of(scenery, agents, e, wish):
     return slots, [*walls, *fixed]
 
 
-def test_a_step_is_the_twins():
+@pytest.mark.parametrize("n_envs, n_steps", [(4, 12), pytest.param(10, 24, marks=pytest.mark.slow)])
+def test_a_step_is_the_twins(n_envs, n_steps):
     """From states that come up in play. Rounding may decide which of two sides touches."""
-    n_envs, n_steps, off, moved = 10, 24, [], 0
+    off, moved = [], 0
     scenery, agents, random = bodies.world(n_envs, "box", seed=7)
     o = scenery.objects
 
@@ -331,7 +332,7 @@ def test_a_step_is_the_twins():
         off.append(gap.abs().amax((1, 2)))
         moved += int((o.velocity != 0).any((1, 2)).sum())
     off = torch.stack(off)
-    assert moved > 30
+    assert moved > n_envs * n_steps / 10
     assert (off < 1e-4).double().mean() > 0.99
 
 
