@@ -91,7 +91,7 @@ class MinAtar(DisplayedEnv):
         id: str = "breakout",
         sticky: Annotated[float, Field(ge=0, le=1)] = 0.1,
         ramping: bool = True,
-        limit: Annotated[int, Field(ge=1, le=10**9)] | None = None,
+        limit: Annotated[int, Field(ge=1, le=10**6)] | None = None,
         seed: int = 1,
         device: torch.device | str | None = None,
     ):
