@@ -130,7 +130,7 @@ def test_a_training_that_fails_ends_the_command_with_its_code(tmp_path, monkeypa
     "words, text",
     [
         (["pong-12s"], "pong-12s needs a GPU"),
-        (["pong-cpu-10"], "did you mean pong-cpu-10m?"),
+        (["pong-cp"], "did you mean pong-cpu?"),
         (["pong-cpu", "seed=2"], "seed: no such key"),
     ],
 )
