@@ -92,7 +92,8 @@ class EvalEnv:
         self.slots = rotating_slots(n_envs, n_agents, self.env.device)[[*self.shard.envs]]
 
     def _made(self) -> Env:
-        where = dict(geometries=[self.homes[home] for home in self.shard.homes], device=self.device)
+        homes = [self.homes[home] for home in self.shard.homes]
+        where: dict = dict(geometries=homes, device=self.device)
         return factory.construct(self.settings, seed=self.seed, **where)
 
     def players(

@@ -42,7 +42,7 @@ def make(
     changes = dict(n_envs=1, resample=True, self_play=True)
     changes |= {} if against is None else {**eval_env.FOR_TWO, "resample": True}
     env_settings = settings.changed_known(trained.env, **changes)
-    where = dict(geometries=chosen, seed=seed, device="cpu")
+    where: dict = dict(geometries=chosen, seed=seed, device="cpu")
     env = cast(Env, factory.construct(env_settings, **where))
     policy = restore.policy_of(loaded, env)
     restore.load_wrappers(env, loaded)

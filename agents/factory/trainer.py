@@ -6,7 +6,7 @@ import random
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ from megastep.imports import import_object
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
+    from megastep.types import Env
 
 
 def make_trainer(
@@ -110,7 +111,7 @@ def make_trainer(
 
                 observers.append(Profiler(folder, cfg.logging.profile, device))
         trainer = Trainer(
-            opponents or env,
+            cast("Env", opponents or env),
             policy,
             learner,
             limits,
@@ -123,7 +124,7 @@ def make_trainer(
         if cfg.population.schedule:
             trainer.tuning.follow(populations.schedule(Path(cfg.population.schedule)))
         if cfg.curriculum.name != "none":
-            parts = dict(env=trainer.env, learner=learner, rollout=trainer.rollout)
+            parts: dict = dict(env=trainer.env, learner=learner, rollout=trainer.rollout)
             sources = factory.sources_of(homes)
             trainer.curriculum = factory.construct(cfg.curriculum, sources=sources, **parts)
         trainer.episodes.begin(trainer, factory.layout_sources(cfg.env, homes), cfg.desync)

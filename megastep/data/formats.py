@@ -130,8 +130,8 @@ def _lerobot(source, folder, progress) -> None:
     frame are of the step that follows it; the last has an action and a reward of zeros.
     """
     import pandas as pd
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    import pyarrow as pa  # pyright: ignore[reportMissingImports]
+    import pyarrow.parquet as pq  # pyright: ignore[reportMissingImports]
 
     writer, features, stats, rows = None, {}, _Stats(), []
     size, file_number, n_frames, fps = 0, 0, 0, round(source.about["fps"])

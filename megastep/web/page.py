@@ -156,7 +156,7 @@ def _themes() -> str:
 # ---- What is shown ----
 
 
-def controls(env: Env) -> dict[str, object]:
+def controls(env: Env) -> Mapping[str, object]:
     """Returns {key of a keyboard: action} of one lane: the environment's ``controls``, movement by
     arrow keys, or digits.
     """
