@@ -36,7 +36,7 @@ MORE = {"geometry=files": [f"geometry.path={sources.BENCH}"]}
 def test_every_group_member_composes():
     composer = Composer(load("train"))
     groups = composer.groups()
-    parts = {"env", "geometry", "agent", "learner", "curriculum", "logger"}
+    parts = {"env", "robot", "geometry", "agent", "learner", "curriculum", "logger"}
     assert set(groups) == parts | {"experiment"}
     assert set(groups["env"]) == set(envs.ENVS)
     assert set(groups["geometry"]) == set(geometries.SOURCES)

@@ -324,6 +324,7 @@ yarl propcache attrs accelerate>=1.10,<2 psutil pandas pyarrow python-dateutil s
 @pytest.fixture(scope="module")
 def lerobot(tmp_path_factory):
     """Python with LeRobot: an environment of its own, which sees the packages of this one."""
+    pytest.importorskip("pyarrow")  # which writes the files, as pandas does
     if python := os.environ.get("LEROBOT_PYTHON"):
         return python
     base = tmp_path_factory.mktemp("lerobot") / "venv"
@@ -336,7 +337,7 @@ def lerobot(tmp_path_factory):
     return str(base / "bin/python")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_lerobot_reads_every_array(twice, lerobot, tmp_path):
     files, folder = twice("lerobot")
     env = dict(os.environ, HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path / "hf"), PYTHONPATH="")
