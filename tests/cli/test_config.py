@@ -29,7 +29,12 @@ def errors(*overrides, script="train"):
 
 
 #: What a member of a group needs beside itself.
-MORE = {"geometry=files": [f"geometry.path={sources.BENCH}"]}
+MORE = {
+    "geometry=files": [f"geometry.path={sources.BENCH}"],
+    "learner=bc": ["learner.data=walks"],
+    "robot=turtlebot3": ["env=pointgoal"],
+    "robot=turtlebot4": ["env=pointgoal"],
+}
 
 
 @pytest.mark.slow
