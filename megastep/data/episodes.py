@@ -24,8 +24,8 @@ from megastep.colour import gamma_decode, gamma_encode
 #: What Memory Maze's offline set calls observations of ours; all others keep their names.
 NAMES = {"rgb": "image", "cue": "target_color"}
 OUTCOMES = "reward", "terminal", "truncated"
-#: Names of what is no observation.
-RESERVED = "action", "mask", *OUTCOMES
+#: Names of what is no observation, or of linear light alone.
+RESERVED = "action", "mask", "image", *OUTCOMES
 #: Names of floor plans, which all rows of an episode share.
 PLANS = "maze_layout", "maze_frame", "walls"
 Arrays = dict[str, np.ndarray]

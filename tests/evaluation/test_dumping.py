@@ -92,6 +92,16 @@ def test_truth_is_in_cells_of_the_maze(mazes):
     assert (ends - ends.round()).abs().max() < 1e-3, "walls are along cells"
 
 
+def test_pictures_that_are_no_light_are_stored_as_they_are(few, tmp_path):
+    folder = dumped(
+        tmp_path / "data", "env=minigrid", "env.id=MiniGrid-Empty-5x5-v0", "seed=5", n=4
+    )
+    env = megastep.make("minigrid", id="MiniGrid-Empty-5x5-v0", n_envs=4, device="cpu")
+    first = env.reset(seed=stream_seed(5, "wave 0")).obs.image
+    for lane, one in enumerate(data.load(folder)):
+        assert torch.equal(one.obs.image[0], first[lane]) and len(one.obs.image) > len(one.reward)
+
+
 def test_an_environment_repeats_the_episodes(few, tmp_path):
     """Replayed by hand from the seed, an environment gives the stored rows."""
     folder = dumped(tmp_path / "data", *HOMES, "env.limit=30", "seed=5", n=8)
