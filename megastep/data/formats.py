@@ -108,7 +108,7 @@ def _minari(source, folder, progress) -> None:
             )
 
     first = _parts(source, episodes.read(source.files[0]))[0]
-    path = mock.patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder))
+    path = mock.patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder.resolve()))
     with path, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of authors, and of an environment that Gymnasium makes
         minari.create_dataset_from_buffers(

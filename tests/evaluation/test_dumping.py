@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -271,17 +272,18 @@ def test_load_refuses_what_is_no_dataset(mazes, tmp_path):
 
 
 @pytest.fixture(params=[HOMES, [*HOMES, "env.control=continuous"]], ids=["discrete", "continuous"])
-def twice(request, tmp_path):
+def twice(request, tmp_path, monkeypatch):
     """Returns a function of a format, which dumps the same as npz and in that format."""
 
     def both(format):
         words = *request.param, "max_steps=12", "truth=true"
         npz = dumped(tmp_path / "npz", *words, n=3)
-        other = dumped(tmp_path / format, *words, f"format={format}", n=3)
+        monkeypatch.chdir(tmp_path)
+        other = dumped(Path(format), *words, f"format={format}", n=3)  # as it is typed
         before = sorted(path.stat().st_mtime_ns for path in other.rglob("*") if path.is_file())
         dumped(other, *words, f"format={format}", n=3)  # is there already
         assert before == sorted(p.stat().st_mtime_ns for p in other.rglob("*") if p.is_file())
-        return [np.load(path) for path in data.load(npz).files], other
+        return [np.load(path) for path in data.load(npz).files], other.resolve()
 
     return both
 
