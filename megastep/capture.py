@@ -37,9 +37,7 @@ class CaptureError(RuntimeError):
 
 
 class _StateBefore:
-    """The tensors and Python scalars reachable from some objects before a function is called, and
-    what lists, deques and dicts held.
-    """
+    """The tensors, Python scalars and contents of containers below objects, before a call."""
 
     def __init__(self, roots) -> None:
         self.roots = dict(enumerate(roots))
@@ -129,9 +127,7 @@ def _copy_back(name, parent, step, old, new) -> None:
 
 
 def _renew_generators(roots) -> None:
-    """Replaces the generators on GPUs: a failed recording leaves those that it registered marked as
-    being captured.
-    """
+    """Replaces GPUs' generators, which a failed recording leaves marked as being captured."""
     renewed = {}
     for parent, step, old in walk(roots, (torch.Generator,)).values():
         if old.device.type == "cuda":
@@ -334,9 +330,7 @@ class HostState(EnvState):
         return comparable
 
     def _is_frozen(self, path) -> bool:
-        """Returns whether a graph repeats nothing there: a tensor or generator on the wrong device,
-        or a generator that is not PyTorch's.
-        """
+        """Returns whether a graph repeats nothing there: another device, another's generator."""
         node = node_at(self.root, path)
         if isinstance(node, (torch.Tensor, torch.Generator)):
             is_small = isinstance(node, torch.Generator) or node.nbytes < LARGE

@@ -85,9 +85,7 @@ class EnvState:
         return dict(records=records, worlds=worlds)
 
     def _records(self) -> dict[str, tuple]:
-        """Returns {path: record} of everything, parents before children. A record is the kind of a
-        node and what `_load` needs to have it again.
-        """
+        """Returns {path: (kind of node, what `_load` needs)} of everything, parents first."""
         records, first_paths = {}, {}
         for path, node, is_users in self._nodes():
             if _is_writable(node):
@@ -192,9 +190,7 @@ class EnvState:
             self._replace(path, type(now)[value] if isinstance(now, enum.Enum) else value)
 
     def _set_tensor(self, path, now, value, device, written) -> None:
-        """Writes into a tensor, or replaces what is none of this shape yet, or began as one with
-        another, which is in `written`.
-        """
+        """Writes into a tensor, or replaces one of another shape, or that is `written` already."""
         is_tensor = isinstance(now, torch.Tensor) and not is_expanded(now)
         is_alike = is_tensor and (now.shape, now.dtype) == (value.shape, value.dtype)
         is_new = _identity(now) not in written
@@ -231,9 +227,7 @@ class EnvState:
         ]
 
     def _nodes(self) -> Iterator[tuple[str, Any, bool]]:
-        """Yields (path, node, whether it is below an object of a class that is not megastep's).
-        Plain values of megastep's own objects never change, or are addresses.
-        """
+        """Yields (path, node, whether it is below an object of a class that is not megastep's)."""
         visited, stack = set(), [("", self.root, False)]
         while stack:
             path, node, is_users = stack.pop()
@@ -327,9 +321,7 @@ def _digest(tensor) -> int:
 
 
 def _encoded(value) -> Any:
-    """Returns a plain value or a generator's state as numbers, strings, lists, dicts and tuples,
-    those of other types as tuples that begin with the type's name.
-    """
+    """Returns a plain value in types that JSON-like files hold; others as ("$type", ...)."""
     if isinstance(value, (np.generic, np.ndarray, complex)):
         value = np.asarray(value)
         return "$numpy", value.dtype.str, value.shape, value.tobytes().hex()

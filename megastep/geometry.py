@@ -78,10 +78,7 @@ def _runs(lows, highs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _touched(walls, shape) -> np.ndarray:
-    """Returns the cells that a wall touches, (H, W) bool with row 0 at the *bottom*. Walls are in
-    units of cells. Each is cut into the rows that it crosses. The piece in a row covers a run of
-    columns; the ends of the runs are counted and summed up along the row.
-    """
+    """Returns cells that walls touch, (H, W) bool, row 0 at the bottom: runs in rows, summed."""
     height, width = shape
     starts = np.take_along_axis(walls, walls[..., 1:].argsort(1), 1)  # lower end first
     (x0, y0), (x1, y1) = starts[:, 0].T, starts[:, 1].T

@@ -326,9 +326,7 @@ def film_moments(player: Player, steps: int, greedy, seed, trail) -> Iterator[tu
 
 
 def _add_past(core: dict, starts: np.ndarray, trails: collections.deque, views: list) -> None:
-    """Adds to a core's state where agents were in this episode, and what they saw: see
-    :meth:`megastep.core.Core.state`. ``starts`` (A,) says whose episodes begin.
-    """
+    """Adds trails and views to a core's state; ``starts`` (A,) says whose episodes begin."""
     for positions in trails:
         positions[starts] = np.nan
     trails.append(np.array(core["positions"], float))

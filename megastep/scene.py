@@ -63,9 +63,7 @@ def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
 
 
 def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the texels of an environment's agents, (K, 3), in 16 colours with a red front, and
-    the number of texels per line, (A M,).
-    """
+    """Returns agents' texels (K, 3), in 16 colours with a red front, and widths (A M,)."""
     widths = texel_widths(model)
     bodies = AGENT_COLOURS[np.arange(n_agents) % len(AGENT_COLOURS), None]
     colours = np.repeat(bodies, len(model), 1)
@@ -92,9 +90,7 @@ def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray
 
 
 def _sorted_along_z_curve(parts) -> np.ndarray:
-    """Returns the walls (M, 2, 2) of all layouts, those of each along a Z-order curve through 1 m
-    cells, so that each group of 32 walls lies close together.
-    """
+    """Returns the walls (M, 2, 2) of each layout along a Z-order curve: groups of 32 are close."""
     walls = np.concatenate(parts)
     cells = walls.mean(1).astype(np.int64)
     order = np.repeat(np.arange(len(parts)), [len(part) for part in parts]) << 16

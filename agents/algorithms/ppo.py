@@ -201,9 +201,7 @@ class PPO(learner.ActorCritic):
         return {**self.steps.end(), "explained_variance": explained}
 
     def _losses(self, rollout, lanes, batch) -> "tuple[torch.Tensor, dict[str, torch.Tensor]]":
-        """Returns the loss of a minibatch and its metrics, tensors (). Observations of its lanes
-        are selected as they are normalised; `batch` has the other parts of its steps.
-        """
+        """Returns the loss of a minibatch and its metrics, (); `batch` has its other parts."""
         policy, privileged = self.policy, without_last(rollout.privileged)
         starts = without_last(batch.starts)
         sequence = without_last(rollout.obs), starts, batch.state, batch.actions

@@ -150,9 +150,7 @@ class VTrace(learner.ActorCritic):
         return with_replayed(batch, self.replay_buffer, self.policy, n_replayed, generator)
 
     def _losses(self, batch, n_fresh) -> tuple[torch.Tensor, dict[str, torch.Tensor], arrdict]:
-        """Returns the loss of a minibatch, its metrics, tensors (), and V-trace's estimates. The
-        first `n_fresh` lanes are from the rollout; the others are replayed.
-        """
+        """Returns loss, metrics () and V-trace's estimates; the first `n_fresh` lanes are new."""
         policy, privileged, numbers = self.policy, batch.get("privileged"), self.coefficients
         reset, weight = batch.starts[1:], batch.weight
         batch["valid"] = valid = ~reset & batch.learns[:-1]

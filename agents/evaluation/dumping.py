@@ -280,9 +280,7 @@ class Waves:
         return arrays, lengths, layout
 
     def _part(self, rollout, last=False) -> dict[str, torch.Tensor]:
-        """Returns a rollout's steps (B, T, ...), or its last observation (B, 1, ...), as they are
-        stored. On a GPU they are there once the stream has been waited for.
-        """
+        """Returns a rollout's steps (B, T, ...), or its last observation (B, 1, ...), as stored."""
         rows = slice(-1, None) if last else slice(None, -1)
         found = {"obs": rollout.obs["seen"], "actions": rollout.actions}
         leaves = spaces.leaves(found)

@@ -83,9 +83,7 @@ def _measure(cfg, loaded, env_settings, geometry, homes, options) -> Path:
 
 
 def _duel(cfg, loaded, where, source, _) -> "tuple[list[Row], list[Row], list[Row]]":
-    """Plays the run's agent against each of `cfg.against`, all from the same places with the same
-    draws, in homes of a `source` or of several. Returns the rows of the table.
-    """
+    """Plays the run's agent against each of `cfg.against`. Returns the rows of the table."""
     agent, rows = eval_env.load_player(loaded, where.sample, loaded), []
     for opponent in where.players(cfg.against, loaded, cfg.trust):
         played = where.duel(cfg, loaded, agent, opponent)

@@ -147,9 +147,7 @@ class Team:
                 self.end(problem)
 
     def _poll(self) -> str | None:
-        """Writes a heartbeat, and compares those of all ranks with the ones before. Returns what
-        has happened, None if no rank is lost.
-        """
+        """Writes a heartbeat and reads all. Returns what has happened, None if no rank is lost."""
         self.n_beats += 1
         beat = LEFT if self.has_left else f"{self.n_beats} {environment.hostname()}"
         self.store.set(self.keys[self.rank], beat)

@@ -335,9 +335,7 @@ class Population:
                 self.lines.write(self.samples, row)
 
     def _are_written(self) -> bool:
-        """Flushes the generations to disk, which a checkpoint must not reach beyond. Returns
-        whether they are there.
-        """
+        """Flushes the generations to disk. Returns whether they are there."""
         return self.lines is None or self.lines.sync()
 
     def close(self) -> None:

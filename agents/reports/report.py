@@ -141,9 +141,7 @@ def _several(every: list[runs.Run], charts: "Charts") -> list[str]:
 
 
 def _population(every, charts) -> list[str]:
-    """Returns the HTML about the population whose members the runs are, if they are: lineage,
-    scores and settings over time.
-    """
+    """Returns the HTML about lineage, scores and settings of a population, if runs are one."""
     path = min(run.folder.parent for run in every) / populations.FILE
     if len({run.folder.parent for run in every}) > 1 or not path.is_file():
         return []
@@ -208,9 +206,7 @@ class Charts(list):
 
 
 def _curves(every: Sequence[runs.Run], groups: Sequence[tuple[list, str]], charts: Charts) -> str:
-    """Returns the places of the metrics' charts, what matters first, without those that never
-    change: a line per group in each.
-    """
+    """Returns the places of charts of all metrics that change, a line per group in each."""
     names = [name for name in runs.metrics_of(every) if name not in NOT_DRAWN]
     kept = [n for n in names if n in ORDER or len({y for r in every for y in r.curve(n)[1]}) > 1]
     rank = {n: next((i for i, start in enumerate(ORDER) if n.startswith(start)), 9) for n in kept}

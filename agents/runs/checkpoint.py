@@ -341,9 +341,7 @@ def _step_and_number(path: Path) -> tuple[int, int]:
 
 
 def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
-    """Deletes all but the last checkpoint of each of the last steps, of the step with the best
-    score and of the last step with a replay buffer; and those set aside up to `step`.
-    """
+    """Deletes all but the last steps, the best, the last with replay; and those set aside."""
     checkpoints, scores = list_checkpoints(folder), {}
     last_of_each_step = [*{step_of(path): path for path in checkpoints}.values()]
     for path in last_of_each_step:

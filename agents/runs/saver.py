@@ -107,9 +107,7 @@ class Saver:
         self._thread.start()
 
     def _with_replay(self, state, is_last) -> StateDict:
-        """Returns the state, without a large replay buffer that is not due, or that there is too
-        little memory to copy.
-        """
+        """Returns the state, without a large replay buffer that is not due or cannot be copied."""
         self.lacks_replay, n_bytes = False, _nbytes(state.get("replay"))
         if n_bytes <= SMALL_REPLAY:
             return state
@@ -195,9 +193,7 @@ class Saver:
 
 
 def _on_host(node, path, pinned, devices) -> object:
-    """Returns a copy on the CPU, from a GPU into pinned memory that is reused, asynchronously: then
-    the GPU is one of the devices.
-    """
+    """Returns a copy on the CPU; from a GPU, which joins `devices`, asynchronously."""
     if isinstance(node, dict):
         return {key: _on_host(part, (*path, key), pinned, devices) for key, part in node.items()}
     if isinstance(node, (list, tuple)):

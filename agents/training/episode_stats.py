@@ -128,9 +128,7 @@ class EpisodeStats:
     def _count(
         self, reward, reset, done, learns, metrics, layouts
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the sums over the episodes that ended, (1 + sources, S, 2, B): of the episode
-        that began before, and of those after it; and whether an episode began, (B,) bool.
-        """
+        """Returns sums over ended episodes, (1 + sources, S, 2, B), and whether one began, (B,)."""
         n_steps, n_lanes = reward.shape
         n_columns = 1 + len(self.sources)
         sums = self.sums.new_zeros(n_columns, self.sums.shape[1], 2, n_lanes)
@@ -319,9 +317,7 @@ class Episodes:
             self.opponents.refresh_snapshots(trainer.policy, trainer.updates)
 
     def _keeps_tensors(self, rollout) -> bool:
-        """Returns whether a rollout is where it was at the first update, as a CUDA graph wants it.
-        A user's own rollout may replace its tensors, and so may a callback.
-        """
+        """Returns whether a rollout is where it was at first, as a CUDA graph wants it."""
         if type(rollout) is not Rollout:
             return False
         names = "reward", "starts", "terminal", "truncated", "learns", "layouts"

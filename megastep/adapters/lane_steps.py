@@ -152,9 +152,7 @@ class Lanes:
         return mask.to(self.device)
 
     def _decision(self, actions) -> arrdict:
-        """Returns the decision of actions (B, ...) of any number type, without an axis of one agent
-        per lane.
-        """
+        """Returns the decision of actions (B, ...) of any number type."""
 
         def converted(space, values) -> torch.Tensor:
             dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32

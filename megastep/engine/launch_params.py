@@ -17,9 +17,7 @@ _STATE = dict(positions=(2,), angles=(), velocity=(2,), angvelocity=())
 
 
 class _Cached:
-    """What was last computed from a key. Without a ``__dict__``, so that checkpoints and
-    :mod:`~megastep.engine.state_tree` do not look inside.
-    """
+    """What was last computed from a key; without a ``__dict__``, so that no checkpoint has it."""
 
     __slots__ = ("key", "value")
 

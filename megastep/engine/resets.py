@@ -126,9 +126,7 @@ def _copies(leaves) -> list[torch.Tensor]:
 
 
 def _first_draw(seed: Integers) -> Integers:
-    """Returns where a seed begins in the numbers of each generator, from 0 to 2**30 - 1: the last
-    step of MurmurHash3, of an integer or a tensor.
-    """
+    """Returns where a seed begins in each generator: the last step of MurmurHash3, 30 bits."""
     x = (seed ^ (seed >> 32)) & MASK32
     x = ((x ^ (x >> 16)) * 0x85EBCA6B) & MASK32
     x = ((x ^ (x >> 13)) * 0xC2B2AE35) & MASK32
@@ -136,9 +134,7 @@ def _first_draw(seed: Integers) -> Integers:
 
 
 def _along(values, n_envs, leaf, axis) -> torch.Tensor:
-    """Returns values (B,) in a shape that broadcasts along an axis of a leaf with B or N rows, or a
-    multiple of N: there an environment's value is True if that of any lane is, or the first lane's.
-    """
+    """Returns values (B,) shaped for a leaf with rows of lanes or of environments: any lane's."""
     n_rows = leaf.shape[axis]
     if n_rows != len(values):
         by_env = values.view(n_envs, -1)

@@ -228,9 +228,7 @@ class Scenery(SetOnce):
         )
 
     def _joined(self, name: str, cure: str, pick: "Callable[[_Part], tuple]") -> RaggedTorch:
-        """Returns a read-only copy of what ``pick`` takes of each environment, values and widths.
-        ``cure``: more words for errors.
-        """
+        """Returns a read-only copy of what ``pick`` takes of each environment: values, widths."""
         refusal = (
             f"scenery.{name} is a read-only copy: write into scenery.layouts.{name}, which reaches "
             f"every environment that shows the layout{cure}"

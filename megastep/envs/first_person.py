@@ -161,9 +161,7 @@ class FirstPerson(SceneryEnv):
         return self._resets.keep(self._world(self.movement(decision).progress))
 
     def _world(self, free: torch.Tensor | None = None) -> arrdict:
-        """Respawns agents whose episode has ended, computes rewards and flags, and renders.
-        ``free``: (N, A), the fraction of the step that was free; None if no step was taken.
-        """
+        """Respawns, judges and renders; ``free``: (N, A), the step's free fraction, or None."""
         raise NotImplementedError
 
     def _view(self, core: Core | None = None, **seen: Any) -> engine.Observation:

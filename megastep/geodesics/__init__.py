@@ -123,9 +123,7 @@ class PathGraph:
     # ---- The visibility graph ----
 
     def _find_corners(self, walls, home) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the corners where a disc fits and a path may turn around the end of a wall:
-        columns (6, V) as in HomesParams, and the home of each, (V,) int32, ascending.
-        """
+        """Returns the corners of paths: columns (6, V) as in HomesParams, and their homes (V,)."""
         rows = np.column_stack([np.repeat(home, 2), walls.reshape(-1, 2)[:, ::-1]])
         rows = np.unique(rows, axis=0)  # (home, y, x) of each end
         owner, ends = rows[:, 0], rows[:, :0:-1]
@@ -163,9 +161,7 @@ class PathGraph:
         return clearances
 
     def _link(self) -> dict[str, torch.Tensor]:
-        """Returns the links between corners that see each other: starts (V + 1,) int32, targets
-        int32, metres float32.
-        """
+        """Returns links between corners that see each other: starts (V + 1,), targets, metres."""
         v, device = len(self.corner_homes), self.device
         counts = torch.empty(v, dtype=torch.int32, device=device)
         kept = torch.empty((v, KEPT), dtype=torch.int32, device=device)
@@ -202,9 +198,7 @@ class PathGraph:
         return [field.reshape(s) for field, s in zip(np.split(lengths, ends), shapes)]
 
     def _all_lengths(self, goals, counts, points=None) -> torch.Tensor:
-        """Returns lengths (P * G,), for each home G rows, from points (P, 2), by default the
-        centres of all cells, ``counts`` (D,) in each home, to goals (D, G <= MAX_GOALS, 2).
-        """
+        """Returns lengths (P * G,) from points (P, 2), or centres of cells, to goals (D, G, 2)."""
         n_goals = goals.shape[1]
         if n_goals > MAX_GOALS:
             raise ValueError(f"{n_goals} goals per home: at most {MAX_GOALS} in one call")

@@ -62,9 +62,7 @@ def _sorted_ends(walls) -> np.ndarray:
 
 
 def _crosses(ends) -> bool:
-    """True if two walls cross at a point that is inside both, or lie on one another for more than a
-    point.
-    """
+    """True if two walls cross inside both, or lie on one another for more than a point."""
     starts, stops = ends[:, 0] + 1j * ends[:, 1], ends[:, 2] + 1j * ends[:, 3]  # x + iy
     lengths = np.abs(stops - starts)
     units = (stops - starts) / lengths

@@ -41,9 +41,7 @@ def _check_size(n_geometries, n_bytes) -> None:
 
 
 def _keys_of(archive) -> list[list[str]]:
-    """Returns the keys of each geometry. Raises ValueError unless the archive holds the indices
-    from 0 up, nothing else, and respects the limits.
-    """
+    """Returns the keys of each geometry. ValueError unless indices run from 0, within limits."""
     keys: dict[int, list[str]] = {}
     entries = archive.zip.infolist()
     for entry in entries:

@@ -192,11 +192,7 @@ def _use(weight: Annotated[int, Field(ge=1, le=1000)] = 1, mirror: bool = False)
 
 
 def _part(name, part) -> tuple[Callable, dict, int, bool]:
-    """Returns the source of a part of `mixed`, its options, its weight and whether it is mirrored.
-
-    Raises:
-        ValueError: if there is no such source, or it takes other options.
-    """
+    """Returns a part of `mixed`: source, options, weight, if mirrored. ValueError for others."""
     options = dict(part) if isinstance(part, dict) else {"n": part}
     source = options.pop("source", name)
     known = [name for name in __all__ if name not in ("mixed", "suite")]

@@ -144,10 +144,7 @@ def _image(space) -> Conversion | None:
 
 
 def _has_channels_last(shape, is_uniform) -> bool | None:
-    """Returns which axis of an image has its channels: False for the first, None if it is none.
-
-    Few channels tell it, then two sides of one length, then the shorter axis.
-    """
+    """Returns which axis of an image has its channels: False for the first, None if none."""
     first, middle, last = shape
     can_be_last, can_be_first = min(first, middle) >= MIN_SIDE, min(middle, last) >= MIN_SIDE
     if can_be_last and last <= FEW_CHANNELS:

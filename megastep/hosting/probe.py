@@ -116,9 +116,7 @@ def _wrappers(env) -> Iterator[Any]:
 
 
 def _statistics(env) -> dict[str, Any]:
-    """Returns the objects with `PARTS` in wrappers by path, such as
-    `0.NormalizeObservation.obs_rms`; wrapper 0 is the outermost.
-    """
+    """Returns the objects with `PARTS` in wrappers by path, `0.NormalizeReward.return_rms`."""
     return {
         f"{number}.{type(wrapper).__name__}.{name}": value
         for number, wrapper in enumerate(_wrappers(env))

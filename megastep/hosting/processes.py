@@ -109,9 +109,7 @@ class VectorProcesses:
         _raise_first(answers)
 
     def _ask(self, command, n_processes=None, **arguments) -> list:
-        """Returns the answer of each process, or of the first, to a command; rows of arguments are
-        divided. Raises the first error.
-        """
+        """Returns the answers of processes, or the first's; rows are divided among them."""
         pipes = self.pipes[:n_processes]
         for pipe, rows in zip(pipes, self.rows):
             own = arguments
@@ -122,9 +120,7 @@ class VectorProcesses:
         return _raise_first([self._receive(number) for number in range(len(pipes))])
 
     def _receive(self, number) -> Any:
-        """Returns the answer of a process, which may be an error of an environment. Raises
-        MemoryError if it was killed, EnvError if it has ended otherwise.
-        """
+        """Returns a process's answer. MemoryError if it was killed, EnvError if it has ended."""
         try:
             return self.pipes[number].recv()
         except (EOFError, OSError):

@@ -64,9 +64,7 @@ def candidates(g, n, random) -> Iterator[np.ndarray]:
 
 
 def _assign(points, owners, candidates, n_agents, size, gap) -> tuple[np.ndarray, np.ndarray]:
-    """Gives candidate points (F, 2) to agents in turn, at most ``size`` each, none nearer than
-    ``gap`` to a point of another agent. Returns all points, and the agent of each.
-    """
+    """Gives candidates (F, 2) to agents in turn, ``gap`` apart. Returns points and agents."""
     if n_agents == 1:
         points = np.concatenate([points, candidates])[:size]
         return points, np.zeros(len(points), int)

@@ -218,9 +218,7 @@ def _line(words, size, bold, colour, dpi) -> tuple[list, float]:
 
 @functools.lru_cache(1024)
 def _word(word, size, bold, colour, dpi) -> tuple[np.ndarray, float, int]:
-    """Returns a word as an image, lowest row first, its width with the space after it, and the rows
-    below letters.
-    """
+    """Returns a word as an image, lowest row first, its width with a space, and rows below."""
     font = _font(size, bold)
     width, _, _ = RendererAgg(1, 1, dpi).get_text_width_height_descent(word, font, False)
     letters = size * dpi / 72

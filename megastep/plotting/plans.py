@@ -204,9 +204,7 @@ def _rectangle(x0, y0, x1, y1) -> Path:
 
 @functools.lru_cache(MAX_KEPT)
 def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
-    """Returns the outline of the rooms, a matplotlib path: the floor that is connected with a
-    light. If walls do not close it, it is the rectangle around them.
-    """
+    """Returns the outline of the floor that is connected with a light, as a matplotlib path."""
     lines = np.frombuffer(lines_bytes, np.float32).reshape(-1, 2, 2)
     if not len(lines):
         return Path(np.zeros((0, 2)))

@@ -97,9 +97,7 @@ def page(program: Program, about: Mapping, code: bytes) -> str:
 
 
 def _packed(buffer: Buffer) -> tuple[int, bytes]:
-    """How a buffer's contents are stored, and what is: 0 nothing, 1 the bytes, 2 its floats as fp16
-    if that loses nothing.
-    """
+    """Returns (0, nothing), (1, the bytes) or (2, floats as fp16 if that loses nothing)."""
     if buffer.contents is None or not any(buffer.contents):
         return 0, b""
     if buffer.is_float:

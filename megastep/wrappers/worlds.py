@@ -24,9 +24,7 @@ Reward = Annotated[float, Field(ge=-(10**6), le=10**6)]
 
 
 def _sensor(wrapper, sensor) -> Space:
-    """Returns the image or vector at a dotted path of the observation space, "" for one that is no
-    dict. Raises ValueError if there is none.
-    """
+    """Returns the space at a dotted path, "" for one that is no dict. ValueError if none."""
     leaves, name = spaces.leaves(wrapper.env.obs_space), type(wrapper).__name__
     if sensor not in leaves:
         hint = "leave sensor out" if "" in leaves else closest(sensor, leaves)

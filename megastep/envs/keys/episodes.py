@@ -123,9 +123,7 @@ def _episodes(g, n, n_colours, n_doors, random) -> tuple[np.ndarray, ...]:
 
 
 def _doors(areas, usable, n_colours, random) -> tuple[np.ndarray, list, np.ndarray]:
-    """Draws which doors are shut. Returns the zone of each area, -1 if it cannot be reached; doors
-    in the order of opening, as (colour, zone of the key, zone behind); and states of doorways (K,).
-    """
+    """Draws which doors are shut. Returns zones of areas, doors in order, states of doorways."""
     n_areas = int(areas.labels.max()) + 1
     part, tree, states = [*range(n_areas)], [], np.full(len(areas.sides), OPEN, np.int32)
     for k in random.permutation(usable).tolist():
@@ -174,9 +172,7 @@ def _lock_ways_around(areas, usable, zones, locked, states) -> None:
 
 
 def _points(points, zones, opened, random) -> list | None:
-    """Draws points (2,) in their zones (P,) for start, goal and the key of each door; None if there
-    is no room.
-    """
+    """Draws points (2,) in their zones (P,); None if there is no room."""
     first = opened[0][1] if opened else zones[random.integers(len(zones))] if len(zones) else 0
     last, chosen = opened[-1][2] if opened else first, []
     for zone in (first, last, *(lies for _, lies, _ in opened)):

@@ -21,9 +21,7 @@ START = 100  # cm; the minimum coordinate of a home
 
 
 def _attempt(count, generator, style) -> list[tuple]:
-    """Tries to plan `count` rooms. Returns [(cost, footprint, rooms, contacts, depth, gaps)], or []
-    if it fails.
-    """
+    """Plans `count` rooms: [(cost, footprint, rooms, contacts, depth, gaps)], [] on failure."""
     programme = plan.programme(count, generator)
     footprint = plan.footprint(sum(size for _, size in programme), generator)
     result = plan.partition(footprint, programme, generator, style)
@@ -61,9 +59,7 @@ def _best_plan(generator, style) -> tuple:
 
 
 def _doorways(gaps, depth, half_blocked, generator) -> tuple[list, list]:
-    """Returns the rectangles in front of doors and openings that stay clear, and the parts of
-    their gaps that clutter blocks, in the fraction `half_blocked` of them.
-    """
+    """Returns rectangles that stay clear before doorways, and blocked parts of some gaps."""
     clear, blocked = [], []
     for g in gaps:
         low, high, reach = g.low, g.high, furniture.PASSAGE

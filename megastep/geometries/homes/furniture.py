@@ -73,12 +73,7 @@ def tight(generator: PortableGenerator) -> int:
 def _place(
     low, high, size, is_walled, generator, passage=PASSAGE, off_wall=0.0
 ) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """Places a piece along an axis of a room, from `low` to `high`. With the probability `off_wall`
-    no wall is nearer than a passage.
-
-    Returns (low, high) of the piece and of what it fills with the walls that it stands by, or None
-    if it blocks the room or a side without a wall.
-    """
+    """Returns (low, high) of a piece along an axis, and of what it fills; None if it blocks."""
     spare = high - low - size
     if spare < 0:
         return None
@@ -95,11 +90,7 @@ def _place(
 
 
 def _roomy(floor, is_walled, generator) -> tuple[Rectangle, Rectangle] | None:
-    """Places a piece with a passage around it on a rectangle of floor.
-
-    Returns the rectangles of the piece and of what it fills with the walls that it stands by, or
-    None if it blocks the room.
-    """
+    """Returns the rectangles of a piece with a passage around it, and of what it fills; or None."""
     x0, y0, x1, y1 = floor
     width, height = (generator.between(*SIZES, step=5) for _ in "xy")
     across = _place(x0, x1, width, is_walled[0::2], generator)
@@ -118,10 +109,7 @@ def _turned(sides) -> Any:
 def _cluttered(
     floor, is_walled, filled, keep_clear, doorway, gap, generator
 ) -> tuple[Rectangle, Rectangle] | None:
-    """Places a piece that leaves narrow gaps. Returns the same as `_roomy`.
-
-    It stands in front of `doorway`, the part of one that clutter blocks, if given.
-    """
+    """As `_roomy`, of a piece that leaves narrow gaps, in front of a `doorway` if given."""
     if doorway:
         turns = doorway[2] - doorway[0] < doorway[3] - doorway[1]
     else:
@@ -137,9 +125,7 @@ def _cluttered(
 def _in_row(
     floor, is_walled, filled, keep_clear, doorway, gap, generator
 ) -> tuple[Rectangle, Rectangle] | None:
-    """Places a piece so that along x it takes a free interval between walls, other pieces and what
-    is kept clear, less narrow gaps. At a wall at one of its ends may be none.
-    """
+    """Places a piece so that along x it takes a free interval, less narrow gaps."""
     x0, y0, x1, y1 = floor
     size = generator.between(*DEEP, step=5)
     if doorway:
@@ -223,9 +209,7 @@ def furnish(
 
 
 def _shape(box, right, up, generator) -> list[Rectangle]:
-    """Returns the rectangles of a piece with this bounding box: all of it, or an L-shape that lacks
-    the corner on these sides.
-    """
+    """Returns the rectangles of a piece in a box: all of it, or an L without a corner."""
     a, b, c, d = box
     if min(c - a, d - b) < 3 * NOTCH or not generator.chance(L_SHAPED):
         return [box]

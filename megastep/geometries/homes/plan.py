@@ -118,9 +118,7 @@ def programme(count: int, generator: PortableGenerator) -> list[tuple[str, int]]
 
 
 def _notch(width, height, fraction, at_corner, generator) -> regions.Rectangle | None:
-    """Draws a rectangle of about `fraction` of the bounding box, at a corner or in the middle of a
-    side. Returns None if it does not fit.
-    """
+    """Draws a rectangle of about `fraction` of the box, at a corner or side; None if none fits."""
     ratio = generator.uniform(0.6, 1.7)
     across = int(sqrt(fraction * width * height * ratio)) // STEP * STEP
     down = int(sqrt(fraction * width * height / ratio)) // STEP * STEP
@@ -220,9 +218,7 @@ def partition(
 
 
 def _divide(region, rooms, generator, corridor, steps_left) -> tuple[list[Room], dict] | None:
-    """Returns the result of `partition` for rooms in this order. `steps_left` counts down over the
-    whole recursion.
-    """
+    """Returns the result of `partition` for rooms in this order; counts `steps_left` down."""
     if len(rooms) == 1:
         return [Room(rooms[0][0], region)], {}
     cuts = _cuts(region, rooms, generator, corridor)
@@ -307,9 +303,7 @@ def _suitable_cut(pairs, lines) -> Cut | None:
 
 
 def _aspect(region, kinds) -> float | None:
-    """Returns long side / short side of a region for rooms, or None if it does not suit them: it
-    is too narrow, or for one room too long or too jagged.
-    """
+    """Returns long side / short side of a region for rooms, or None if it does not suit them."""
     is_room = len(kinds) == 1
     if not region or not regions.connected(region, 90 if is_room else PORTAL):
         return None

@@ -63,9 +63,7 @@ def read(content: bytes) -> list[Drawing]:
 
 
 def _doorways(floor) -> list[BaseGeometry]:
-    """Returns the doorways of a floor, which marks none: the floor between the end of a wall, a
-    short edge with floor around both of its corners, and what the wall would meet if it went on.
-    """
+    """Returns doorways, which no file marks: floor between a wall's end and what it would meet."""
     outline, doors, middles = orient(shapely.simplify(floor, ROUGH)), [], np.zeros((0, 2))
     for ring in (outline.exterior, *outline.interiors):
         points = np.array(ring.coords[:-1])

@@ -55,9 +55,7 @@ def _home(drawing, sealed=True, tolerance=outlines.CURVED) -> tuple[dotdict, Not
 
 
 def _limited(work: Callable[[], T]) -> T:
-    """Returns what `work` returns, in a process of its own, which ends after SECONDS of a core, as
-    nothing else ends work within GEOS. Raises ValueError then, and if `work` does.
-    """
+    """Returns what `work` returns, in a process that ends after SECONDS of a core; ValueError."""
     reading, writing = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of threads, which it does not use

@@ -174,9 +174,7 @@ def read(grid: Map) -> tuple[Drawing, np.ndarray, list[str]]:
 
 
 def _cleaned(free, resolution) -> np.ndarray:
-    """Returns the free cells without speckles, and with bumps and dents of a cell smoothed away. A
-    wall stays that is one cell thick, and so do corners.
-    """
+    """Returns the free cells without speckles, bumps and dents; thin walls and corners stay."""
     same = [
         np.where(free, n, around.sum() - n)
         for around in (ANY, CROSS)
@@ -214,9 +212,7 @@ def _area(cells, resolution) -> BaseGeometry:
 
 
 def _with_corners(points) -> np.ndarray:
-    """Returns a contour, of points in the middle of the sides of cells, with the corners that it
-    cuts, but for those of staircases, which are slanted walls.
-    """
+    """Returns a contour with the corners that it cuts, but for those of slanted walls."""
     points = np.round(points * 2) / 2
     following = np.roll(points, -1, 0)
     steps = following - points

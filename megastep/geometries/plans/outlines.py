@@ -277,9 +277,7 @@ def _reachable(g, rooms, n_sealed, warnings) -> tuple[dotdict, Notes]:
 
 
 def _light(parts, g, distance, cell) -> np.ndarray:
-    """Returns a room's centroid if that is indoors and clear of walls, else the middle of its
-    largest disc.
-    """
+    """Returns a room's centroid if that is clear of walls, else its largest disc's middle."""
     part = max(parts, key=lambda part: part.area)
     at = np.array(part.centroid.coords[0])
     clear = distance[tuple(geometry.indices(at, distance.shape, cell))]
