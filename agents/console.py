@@ -109,11 +109,8 @@ def table(
     is_markdown: bool = False,
     width: int | None = None,
 ) -> str:
-    """Returns a table as text: in Markdown, or in characters that stdout can show.
-
-    Args:
-        width: in characters. The last columns are left out until it fits, and a line below names
-            them. The first two stay.
+    """Returns a table as text, in Markdown or in characters that stdout can show. The last columns
+    that do not fit into a width are left out, and named below.
     """
     from rich import box
     from rich.console import Console

@@ -13,11 +13,9 @@ MARK = ".tmp-"
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields an unused path beside `path`. The file or folder that is made there takes the place of
-    `path` at the end of the context, or is deleted if there is an error.
-
-    Readers see the old content or the new, even if the process is killed or the power fails. The
-    last of several writers wins.
+    """Yields an unused path beside `path`. What is made there takes its place at the end of the
+    context, or is deleted after an error: readers see the old content or the new, even if the power
+    fails.
     """
     temporary = path.with_name(f"{path.name[:40]}{MARK}{secrets.token_hex(8)}")
     try:
@@ -31,9 +29,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Writes a file as `replacing` does, with permissions less those that the umask takes. If it
-    raises OSError, the old file is unchanged.
-    """
+    """Writes a file as `replacing` does, with permissions less those of the umask."""
     with replacing(path) as temporary:
         with open(temporary, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.write(data)

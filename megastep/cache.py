@@ -26,9 +26,7 @@ DIGEST = 32  # bytes
 
 
 def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
-    """Returns a file's content, which ``build`` makes if it is not cached, and its path, None if
-    the cache cannot be used.
-    """
+    """Returns a file's content, made by ``build`` if need be, and its path, None without a cache."""
     path = _folder() / name
     if problem := _problem(path.parent):
         warn(problem)

@@ -47,8 +47,8 @@ def import_path(thing: object) -> str:
 
 
 def search_current_folder() -> None:
-    """Adds the current folder to `sys.path`: before installed packages, so that none shadows a
-    module of the user, and after the standard library, so that a `random.py` there breaks nothing.
+    """Adds the current folder to `sys.path`: before installed packages, so that none shadows the
+    user's modules, and after the standard library, so that a `random.py` breaks nothing.
     """
     here = os.getcwd()
     if here not in sys.path:

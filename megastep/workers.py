@@ -25,10 +25,7 @@ WORKER_ENV = {
 
 @contextlib.contextmanager
 def terminal_signals_blocked() -> Iterator[None]:
-    """Processes started inside never receive Ctrl-C or SIGHUP; whoever starts them stops them.
-
-    A terminal sends both to every process it runs, and a child inherits its parent's signal mask.
-    """
+    """Processes started inside inherit a mask: a terminal's Ctrl-C or SIGHUP never reaches them."""
     signals = {signal.SIGINT, signal.SIGHUP}
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     try:
@@ -43,9 +40,7 @@ def terminal_signals_blocked() -> Iterator[None]:
 
 @functools.cache
 def end_with_parent(parent: int) -> None:
-    """Sends this process, a child of ``parent``, SIGTERM within a second of its parent's end. Can
-    initialise a pool's workers.
-    """
+    """Sends this process SIGTERM within a second of the end of ``parent``, its parent."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -67,11 +67,8 @@ def is_import_path(value: object) -> bool:
 
 
 class Composer:
-    """Composes and checks the configuration of one command.
-
-    Args:
-        name: another file than the command's own.
-        folder: a folder whose files and groups are found beside ours.
+    """Composes and checks the configuration of one command, from a file `name`, and from a folder
+    whose files and groups are found beside ours.
     """
 
     def __init__(self, command: "Command", name: str | None = None, folder: str | None = None):

@@ -34,12 +34,8 @@ def parse(
     cure: Callable[[str], str] = str,
     loader: "ConfigLoader | None" = None,
 ) -> list[types.Override]:
-    """Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable ones.
-
-    Args:
-        kind: of the settings. A list among them needs no brackets: run=a,b.
-        cure: what is said of a word without `=`.
-        loader: Hydra's, for glob().
+    """Returns words as Hydra's grammar reads them; a list needs no brackets: run=a,b. `cure` says
+    what is said of a word without `=`. Raises ConfigErrors with all unreadable ones.
     """
     parser = overrides_parser.OverridesParser.create(loader)
     fields = kind.__pydantic_fields__.items()

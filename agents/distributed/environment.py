@@ -17,10 +17,8 @@ class RankInfo(NamedTuple):
 
 
 def rank_info() -> RankInfo | None:
-    """Returns this process's rank if torchrun started it, None for a single process.
-
-    Raises:
-        ValueError: torchrun's variables contradict each other.
+    """Returns this process's rank if torchrun started it, None for a single process. ValueError if
+    torchrun's variables contradict each other.
     """
     if any(name not in os.environ for name in NAMES):
         return None

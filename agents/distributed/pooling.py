@@ -89,9 +89,7 @@ def _in_common_dtype(x, others) -> torch.Tensor:
 def pool_with_condition(
     condition: torch.Tensor, *moments: Moments
 ) -> tuple[torch.Tensor, list[Moments]]:
-    """Returns whether a condition, () bool, is true on every rank, as () bool, and
-    `pool_moments(*moments)`, in one collective.
-    """
+    """Returns whether a condition, () bool, is true on every rank, and the pooled moments."""
     if n_pooled() == 1:
         return condition, list(moments)
     one = torch.ones_like(condition, dtype=torch.int64)

@@ -88,9 +88,7 @@ def _connection(is_master=False) -> TCPStore:
 
 
 def store(name: str, is_shared: bool = True) -> Store:
-    """Returns the ranks' key-value store, with a prefix of its keys, over a connection that this
-    process shares or another one, for another thread.
-    """
+    """Returns the ranks' key-value store with a prefix, over a shared connection or another."""
     keys, info = _store(), rank_info()  # where rank 0 hosts it, it must do so first
     job = os.environ.get("TORCHELASTIC_RUN_ID", "")  # torchrun's --rdzv-id, or a random name
     return distributed.PrefixStore(  # pyright: ignore[reportPrivateImportUsage]
@@ -160,11 +158,8 @@ def from_rank(number: int, value: T) -> T:
 
 
 def together(function: Callable[[], T]) -> T:
-    """Calls a function, which waits for no other rank, on every rank. Returns this rank's result.
-
-    Raises:
-        Exception: on all ranks, the error of the first rank that failed. Unless that is rank 0, its
-            label is in the message.
+    """Calls a function, which waits for no other rank, on every rank. Returns this rank's result,
+    or raises on all the error of the first that failed, with its label unless that is rank 0.
     """
     if n_ranks() == 1:
         return function()
@@ -180,9 +175,7 @@ def together(function: Callable[[], T]) -> T:
 
 
 def from_rank_0(function: Callable[[], T]) -> T:
-    """Calls a function on rank 0. Returns its small picklable result, or raises its error, on every
-    rank.
-    """
+    """Calls a function on rank 0. Returns its picklable result, or raises its error, on all."""
     values = gather_objects(together(lambda: function() if rank() == 0 else None))
     return cast(T, values[0])
 

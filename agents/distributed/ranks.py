@@ -60,10 +60,7 @@ class Ranks(NamedTuple):
         return any(is_true for (is_true,) in self.exchange([condition]))
 
     def sum(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns the sum of the ranks' tensors, float64 on the host. Synchronises.
-
-        They are exchanged on their device, between GPUs ten times as fast as on the host.
-        """
+        """Returns the sum of the ranks' tensors, exchanged on their device, float64 on the host."""
         values = values.double()
         return (values if self.n == 1 else all_gather(values).sum(0)).cpu()
 
@@ -77,9 +74,7 @@ class Ranks(NamedTuple):
         return means
 
     def gather_if_any(self, value: T, is_needed: bool) -> list[T]:
-        """Returns the small picklable values of all ranks if any rank needs them, otherwise only
-        this rank's.
-        """
+        """Returns the picklable values of all ranks if any needs them, otherwise this rank's."""
         is_needed = self.any(is_needed)
         return process_group.gather_objects(value) if is_needed and self.n > 1 else [value]
 

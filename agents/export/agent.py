@@ -45,9 +45,7 @@ BY_HAND = "## What it is for"
 
 
 def rounded(policy: Policy) -> dict[str, torch.Tensor]:
-    """Returns a policy's state with weights as float16; statistics keep their dtype. Raises
-    UserError if a weight is too large.
-    """
+    """Returns a policy's state with weights as float16. UserError if one is too large."""
     weights = dict(policy.named_parameters())
     state = {k: v.half() if k in weights else v for k, v in policy.state_dict().items()}
     for name, tensor in state.items():
@@ -63,10 +61,8 @@ def command_of(words: str) -> str:
 
 
 def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
-    """Returns the evaluations of a run after so many samples, oldest first: titles, commands
-    without their run, and rows, of others only those whom everybody has. Of an environment with
-    floor plans those in geometry=suite, or, if there are none, those in homes of the run's own
-    source.
+    """Returns the evaluations of a run after so many samples, oldest first: titles, commands, and
+    rows of players that everybody has; of geometry=suite if there are such and `has_homes`.
     """
     suites, others = [], []
     own = vars(components.settings_for("geometry", components.SUITE))
@@ -111,11 +107,8 @@ def _rows_of_known(rows, kind, players) -> "list[Row]":
 
 
 def write(run: str, file: Path) -> None:
-    """Writes the file of an agent, NAME.safetensors, and its card. Raises UserError if a weight is
-    too large, or they cannot be written.
-
-    Args:
-        run: a run's folder, or one of its checkpoints.
+    """Writes the file of a run's agent, NAME.safetensors, and its card. Raises UserError if a
+    weight is too large, or they cannot be written.
     """
     loaded = folders.load_checkpoint(folders.find(run), False, factory.make_device("cpu"))
     if not loaded.numbers:
@@ -148,12 +141,8 @@ def write_loaded(
     rows: "Sequence[Row]" = (),
     env: Env | None = None,
 ) -> None:
-    """Writes a loaded checkpoint as an agent's file with a card, as `write` does.
-
-    Args:
-        facts: how it was trained.
-        rows: its evaluations, see `tables_of`.
-        env: where it must be able to act.
+    """Writes a loaded checkpoint, which must be able to act in `env`, as an agent's file with a
+    card: how it was trained, `facts`, and its evaluations, `rows`.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", file.stem):
         raise UserError(
@@ -176,9 +165,7 @@ def write_loaded(
 
 
 def write_card(file: Path, config: "Config", facts: "Row", rows: "Sequence[Row]") -> None:
-    """Writes the card beside an agent's file, NAME.md. Keeps what its author wrote; warns and does
-    nothing if this file is something else.
-    """
+    """Writes the card beside an agent's file, and keeps what its author wrote in it."""
     path, title = file.with_suffix(".md"), f"# {file.stem}\n"
     text = path.read_text() if path.exists() else title
     if not text.startswith(title):

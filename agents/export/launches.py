@@ -40,17 +40,9 @@ class Acting(NamedTuple):
 def add_policy(
     program: Program, policy: Policy, lanes: range, section: str = "policy", seed: int = 1
 ) -> Acting:
-    """Adds a policy's forward pass to a program.
-
-    Args:
-        program: gets the section, and memory.
-        policy: what acts.
-        lanes: where it acts: it reads their observations, and writes their actions.
-        section: name of the launches.
-        seed: of the actions. Their draws are not PyTorch's.
-
-    Raises:
-        UserError: it has a core or an encoder of the user's, or actions of several kinds.
+    """Adds the forward pass of a policy that acts in some lanes to a program, as a section of
+    launches and memory. The draws of its actions are not PyTorch's. Raises UserError for a core or
+    an encoder of the user's, or actions of several kinds.
     """
     lowering = _Lowering(program, policy, lanes, seed)
     width, policy = policy.width, lowering.policy

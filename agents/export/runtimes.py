@@ -59,11 +59,8 @@ class Port(NamedTuple):
 
 
 class Step(nn.Module):
-    """Acts greedily for one step, as `policy(world, state, sample=False)` does on a CPU.
-
-    Args:
-        policy: the policy, which acts.
-        world: an example of what it sees.
+    """Acts greedily for one step, as `policy(world, state, sample=False)` does on a CPU; `world` is
+    an example of what it sees.
     """
 
     def __init__(self, policy: "Policy", world: World):
@@ -149,15 +146,8 @@ def _nested(flat) -> Tree:
 
 
 def write(run: Path, path: Path) -> str:
-    """Writes a step of a run's policy, and compares what runs it with the policy. Returns what was
-    written.
-
-    Args:
-        run: from `folders.find`.
-        path: as for `save`.
-
-    Raises:
-        UserError: the file cannot be written, or acts otherwise.
+    """Writes a step of a run's policy, as `save` does, and compares what runs it with the policy.
+    Returns what was written. UserError if the file cannot be written, or acts otherwise.
     """
     loaded = folders.load_checkpoint(run, False, "cpu")
     trained = factory.config_of(loaded)
@@ -199,11 +189,8 @@ def description(step: Step, env: Env) -> dict:
 
 def save(step: Step, path: Path, name: str = "the policy") -> None:
     """Writes a step as a graph of PyTorch's operators, of any number of lanes: an ONNX file, with
-    its ports as the metadata `megastep`, if the path ends with .onnx, else one for
-    `torch.export.load`, with its ports as the extra file `ports.json`.
-
-    Raises:
-        UserError: packages are missing, or a core or an encoder of the user's cannot be exported.
+    its ports as the metadata `megastep`, or one for `torch.export.load`, with its ports as
+    `ports.json`. UserError if packages are missing, or a part of the user's cannot be exported.
     """
     is_onnx, content = path.suffix == ".onnx", io.BytesIO()
     if is_onnx:
@@ -256,11 +243,8 @@ def runner(path: Path) -> Runner:
 def compare(
     step: Step, run: Runner, policy: "Policy", env: Env, name: object, n_steps: int = 1000
 ) -> float:
-    """Returns how far apart the numbers of a file and of a policy are: both act on the same worlds,
-    each with its own hidden state, with more resets than the environment's own.
-
-    Raises:
-        UserError: the file, called `name`, acts otherwise than the policy.
+    """Returns how far apart the numbers of a file and of a policy are in the same worlds, with more
+    resets than the environment's own. UserError if the file acts otherwise.
     """
     world, state = env.reset(), policy.initial(n_lanes(env))
     own = state.map(torch.clone) if state else state

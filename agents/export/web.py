@@ -24,16 +24,9 @@ N_HOMES = 4
 def make(
     run: str, against: str | None = None, homes: Sequence[int] | None = None, seed: int = 1
 ) -> str:
-    """Returns an HTML page in which an agent plays.
-
-    Args:
-        run: a run, one of its checkpoints, or a packaged agent.
-        against: who plays the other agents: another run; default: the agent itself.
-        homes: numbers of homes of the test split; default: the first `N_HOMES`.
-        seed: of the first episodes.
-
-    Raises:
-        UserError: the environment or a policy cannot be exported; or the page is too large.
+    """Returns an HTML page in which the agent of a run plays against that of another, or itself, in
+    homes of the test split, by number. UserError if the environment or a policy cannot be exported,
+    or the page is too large.
     """
     loaded = folders.load_checkpoint(folders.find(run), False, factory.make_device("cpu"))
     trained, name = factory.config_of(loaded), folders.name_of(loaded.path)

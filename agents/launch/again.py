@@ -43,12 +43,9 @@ def with_more(cfg: settings.Train) -> settings.Train:
 
 
 def automatic(cfg: settings.Train) -> Start:
-    """Decides whether `resume=auto` starts a run, continues it or has nothing left to do.
-
-    Raises:
-        ConfigErrors: a setting outside `RESUMABLE` differs from the run's, `more_samples` or
-            `more_seconds` is given, or `folder` is missing, and this is not a Slurm job.
-        UserError: the folder holds something other than a run, or no intact checkpoint.
+    """Decides whether `resume=auto` starts a run, continues it or has nothing left to do. Raises
+    ConfigErrors if a setting outside `RESUMABLE` differs from the run's, or `folder` is missing;
+    UserError if the folder holds something else, or no intact checkpoint.
     """
     for key in ("more_samples", "more_seconds"):
         if getattr(cfg, key) is not None:

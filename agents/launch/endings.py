@@ -32,10 +32,8 @@ class Ending(NamedTuple):
 
 
 def ending_of(work: Callable[[], int | None]) -> Ending:
-    """Calls a function, which returns an exit code or None for 0. Returns how it ended.
-
-    Raises:
-        Exception: errors that the user cannot fix, such as bugs.
+    """Calls a function, which returns an exit code or None for 0. Returns how it ended, or raises
+    what the user cannot fix, such as bugs.
     """
     try:
         with signals.interrupting():

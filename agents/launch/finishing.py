@@ -58,9 +58,7 @@ def next_command(cfg: settings.Train, folder: Path) -> str:
 
 
 def compare(folder: Path, original: Path) -> None:
-    """Checks that two runs have the same metrics, or two populations the same generations and
-    members with the same metrics. Raises UserError if not.
-    """
+    """Checks that two runs, or populations, have the same metrics. UserError if not."""
     members, what = populations.members(original), f"{METRICS} equals that"
     names = [METRICS]
     if members:

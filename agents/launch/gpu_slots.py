@@ -16,9 +16,7 @@ VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
 def check(jobs: Sequence, hydra: Any) -> None:
-    """Raises ConfigErrors if a job has more ranks than there are GPUs, or Hydra's launcher would
-    run each job several times.
-    """
+    """Raises ConfigErrors for more ranks than GPUs, or a launcher that repeats each job."""
     kind, options = hydra.runtime.choices["hydra/launcher"], hydra.launcher
     elsewhere = "a job is one task on one node; docs/scaling.md has a script for several nodes"
     for key in ("nodes", "tasks_per_node"):
@@ -38,12 +36,9 @@ def check(jobs: Sequence, hydra: Any) -> None:
 
 @contextlib.contextmanager
 def taken(cfg: settings.Common, number: int) -> Iterator[settings.Common]:
-    """Gives a job a slot, by its number in the sweep, for the duration of the context. Yields the
-    settings, in which device=cuda is replaced by the GPU's number.
-
-    Ranks are separate processes and see only the GPUs of their slot. For a job in this process, the
-    GPU becomes PyTorch's current device, which device=auto uses. A job with device=cpu or cuda:1
-    takes no slot.
+    """Gives a job a slot, by its number in the sweep, for the context. Ranks see only its GPUs; for
+    a job in this process it is PyTorch's current device. Yields the settings, in which device=cuda
+    is replaced by the GPU's number. A job with device=cpu or cuda:1 takes no slot.
     """
     n_gpus = gpu.count() if cfg.device in ("auto", "cuda") else 0
     if n_gpus < 2:

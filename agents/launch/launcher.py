@@ -37,11 +37,7 @@ sys.exit(train.run_rank())"""
 
 
 def n_ranks(cfg: settings.Train) -> int:
-    """Returns the number of ranks of a training run.
-
-    Raises:
-        ConfigErrors: there is not a GPU for every rank.
-    """
+    """Returns the number of ranks of a run. ConfigErrors if there is not a GPU for each."""
     if cfg.ranks == 1:
         return 1
     n_gpus = gpu.count() if cfg.device != "cpu" else 0
@@ -68,11 +64,7 @@ def is_needed(cfg: settings.Train) -> bool:
 
 
 def run(cfg: settings.Train) -> Path:
-    """Trains with several ranks. Returns the run folder.
-
-    Raises:
-        UserError, Interrupted: as for training in this process.
-    """
+    """Trains with several ranks. Returns the run folder. Raises as training in this process."""
     cfg = settings.changed(cfg, ranks=n_ranks(cfg))
     with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
         job = Job(Path(folder), cfg)
@@ -108,9 +100,7 @@ class Job:
         (folder / endings.SETTINGS).write_text(typed_json.dumps(facts))
 
     def run(self) -> endings.Ending:
-        """Runs the ranks, in sessions of their own, as this process forwards signals. Returns how
-        they ended. Once one has failed, it kills the others, unless they are saving.
-        """
+        """Trains with several ranks. Returns the run folder. Raises as training in this process."""
         listener, failure = socket.create_server((ADDRESS, 0)), None
         shared = os.environ | variables(self.folder, self.n_ranks)
         shared |= {"MASTER_PORT": f"{listener.getsockname()[1]}"}

@@ -30,14 +30,8 @@ def refuse(problem: str) -> None:
 
 @contextlib.contextmanager
 def joined() -> "Iterator[Team | None]":
-    """Joins the ranks that torchrun started. If one fails, all end and one of them reports it.
-
-    Yields:
-        The team; None in a single process. Nested contexts yield the same team.
-
-    Raises:
-        UserError, Interrupted: as in a single process, if this rank reports the error.
-        SystemExit: another rank reports it.
+    """Joins the ranks that torchrun started, and yields the team; None in a single process. If one
+    fails, all end, and one reports it as a single process does; the others raise SystemExit.
     """
     global _team
     with user_errors():

@@ -59,11 +59,8 @@ class Run:
         self.progress = console.Progress()
 
     def run(self) -> Path:
-        """Opens or continues the run, trains, and finishes it. Returns its folder.
-
-        Raises:
-            Interrupted: a signal came; the run was saved.
-            UserError: training cannot start or continue.
+        """Opens or continues the run, trains, and finishes it. Returns its folder. Raises
+        Interrupted after a signal, once saved; UserError if training cannot start or continue.
         """
         if self.cfg.resume == again.AUTO:
             start = together(lambda: again.automatic(self.cfg))
@@ -243,11 +240,8 @@ def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:
 
 
 def check_shared(folder: Path) -> str:
-    """Checks that all ranks see the run folder of rank 0. Returns a random name of this start, the
-    same on all ranks.
-
-    Raises:
-        UserError: on all ranks, if one of them does not see the folder.
+    """Checks that all ranks see the run folder of rank 0: UserError on all, if one does not.
+    Returns a random name of this start, the same on all ranks.
     """
     name = from_rank_0(secrets.token_hex)
     path = folder / f".ranks-{name}"

@@ -40,9 +40,7 @@ def interrupt(number: int) -> NoReturn:
 
 
 def exit_on_signals(script: str) -> None:
-    """Makes signals end the process at once, with one line. For imports and interpreter shutdown,
-    when there is nothing to save.
-    """
+    """Makes signals end the process at once, with one line, while there is nothing to save."""
 
     def exit_at_once(number, frame) -> NoReturn:
         if environment.rank() == 0:
@@ -57,13 +55,9 @@ def exit_on_signals(script: str) -> None:
 def handled(
     on_first: Callable[[int], None], on_second: Callable[[int], None] = lambda number: None
 ) -> Iterator[list[int]]:
-    """Handles signals for the duration of the context.
-
-    A second Ctrl-C or SIGTERM ends the process at once; after SIGUSR1 or SIGUSR2 it counts as the
-    first. Ending at once is safe: checkpoints are written to a temporary folder and renamed.
-
-    Yields:
-        A list, empty until the first signal's number is appended.
+    """Handles signals for the context, which gets a list, empty until the first signal's number is
+    in it. A second Ctrl-C or SIGTERM ends the process at once, which is safe: checkpoints are
+    renamed when they are whole. After SIGUSR1 or SIGUSR2 it counts as the first.
     """
     numbers, ends_after = [], None
 

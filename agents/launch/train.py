@@ -19,14 +19,9 @@ from megastep.types import n_lanes, optional
 
 
 def run(cfg: settings.Train) -> Path | None:
-    """Trains. Returns the run folder, None for a dry run.
-
-    If torchrun started this process, it trains as one of the ranks; rank 0 writes the run folder.
-    With `cfg.ranks`, this process starts the ranks and waits for them.
-
-    Raises:
-        Interrupted: a signal came; the run was saved.
-        UserError: training cannot start or continue.
+    """Trains, as one of the ranks if torchrun started this process, or starting `cfg.ranks` of
+    them. Returns the run folder, None for a dry run. Raises Interrupted after a signal, once saved;
+    UserError if training cannot start or continue.
     """
     if cfg.dry_run:
         return dry_run(cfg)
@@ -43,9 +38,7 @@ def run(cfg: settings.Train) -> Path | None:
 
 
 def run_rank() -> int:
-    """Trains as one of the ranks that `launcher` started. Returns the exit code: 0 if this rank has
-    said how it ended.
-    """
+    """Trains as one of the ranks of `launcher`. Returns the exit code: 0 if it said how it ended."""
     facts = typed_json.loads(Path(os.environ[endings.JOB], endings.SETTINGS).read_text())
     sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
     workers.end_with_parent(facts["parent"])
@@ -70,10 +63,8 @@ def run_rank() -> int:
 
 
 def dry_run(cfg: settings.Train) -> None:
-    """Prints environments, lanes and batch sizes, per rank or per member of a population, and in
-    total. Writes no file.
-
-    A machine without a GPU, such as a login node, tells the sizes of `device=cuda`, too.
+    """Prints environments, lanes and batch sizes, per rank or member and in total, and writes
+    nothing; also for `device=cuda` on a machine without a GPU.
     """
     n_ranks, n_members = launcher.n_ranks(cfg), cfg.population.size
     is_elsewhere = cfg.device.startswith("cuda") and not gpu.is_available()
@@ -92,9 +83,7 @@ def dry_run(cfg: settings.Train) -> None:
 
 
 def sizes(cfg: settings.Train, device) -> dict[str, int]:
-    """Returns the sizes of one rank by name; omits those that the learner does not define. Raises
-    UserError if the opponents do not fit.
-    """
+    """Returns the sizes of one rank by name. UserError if the opponents do not fit."""
     geometries = factory.homes(cfg.env, cfg.geometry, "training")
     options = dict(seed=cfg.seed, device=device, privileged=cfg.agent.critic == "asymmetric")
     sample = factory.make_sample(cfg.env, geometries, **options)

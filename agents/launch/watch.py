@@ -44,9 +44,8 @@ NUMBERS = itertools.count()
 
 
 def within(seconds: float | None, function: Callable[[], T], default: T) -> T:
-    """Returns what a function returns, or a default if that takes longer or fails.
-
-    Calls it in a thread, which is left behind if it is blocked.
+    """Returns what a function returns, or a default if that takes longer, in a thread that is left
+    behind, or fails.
     """
     values = [default]
 
@@ -61,11 +60,7 @@ def within(seconds: float | None, function: Callable[[], T], default: T) -> T:
 
 
 class Team:
-    """The ranks of a training run, as one of them sees and monitors them, until `leave`.
-
-    Attributes:
-        folder: the run folder, once it is known.
-    """
+    """The ranks of a run, as one of them sees and monitors them, until `leave`."""
 
     def __init__(self) -> None:
         info = environment.rank_info()
@@ -117,9 +112,7 @@ class Team:
         self.end(f"A rank is lost: {loss}" if self.claim() else None)
 
     def leave(self, seconds: float = 0.0) -> None:
-        """Stops the watch, so that this rank no longer counts as lost, and waits so many seconds
-        for rank 0 to leave, too.
-        """
+        """Stops the watch, so that this rank is not lost, and waits for rank 0 to leave, too."""
         deadline = time.monotonic() + seconds
         self.has_left = True
         self._wakes.set()

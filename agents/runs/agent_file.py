@@ -58,15 +58,8 @@ def write(
     tables: Sequence[Row] = (),
     wrappers: Mapping[str, object] | None = None,
 ) -> None:
-    """Writes an agent file atomically. Raises OSError.
-
-    Args:
-        path: the file.
-        tensors: the policy's state, on the CPU, in the dtypes to store.
-        config: configuration as in a checkpoint.
-        facts: plain values by name, among them `samples`.
-        tables: evaluations.
-        wrappers: of the environment, what they have learnt, by path: tensors and numbers.
+    """Writes an agent file atomically: the policy's state, on the CPU, in the dtypes to store; and
+    what this file's head describes. Raises OSError.
     """
     from safetensors.torch import save
 

@@ -106,13 +106,9 @@ def save(
     a folder at a time. Raises OSError if the disk is full; other checkpoints are unchanged then.
 
     Args:
-        folder: the run's `checkpoints` folder.
         step: environment steps so far, of all lanes.
         state: dicts and lists of tensors and numbers.
-        config: the run's configuration, JSON.
         keep_checkpoints: number of latest steps to keep, besides the one with the highest score.
-        score: such as the mean return, higher is better; None if unknown.
-        made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
         add_files: puts the files of other ranks into the checkpoint's folder.
     """
     folder = Path(folder)
@@ -213,19 +209,14 @@ def load_latest(
 def read(
     path: Path, device: torch.device | str | None, is_whole: bool = False, rank: int = 0
 ) -> Checkpoint:
-    """Loads a checkpoint. Opens all files before it reads any, so it can still read them if the run
-    deletes them meanwhile.
+    """Loads a checkpoint. Opens all files before it reads any, as the run may delete them
+    meanwhile. Raises DamagedCheckpoint if a file is missing, damaged, or could run code;
+    CheckpointError if another version wrote it.
 
     Args:
-        path: the checkpoint's folder.
-        device: of the tensors in `state.pt`; None verifies all files, loads no state and does not
-            import PyTorch.
+        device: of the tensors in `state.pt`; None verifies all files and loads no state.
         is_whole: also loads the rank's other files, to the CPU; rank 0 verifies all files.
-        rank: the rank whose state is loaded. If it has no file, only rank 0's `state.pt` is read.
-
-    Raises:
-        DamagedCheckpoint: a file is missing, damaged, or could run code when loaded.
-        CheckpointError: another version of megastep wrote it.
+        rank: whose state is loaded; without a file of its own only rank 0's `state.pt`.
     """
     manifest = read_manifest(path)
     written, parts = manifest["files"], ["state.pt"]
@@ -323,9 +314,7 @@ def step_of(path: Path) -> int:
 
 
 def set_aside_after(folder: Path | str, step: int) -> None:
-    """Renames checkpoints later than `step` to `step_<N>.aside`, as a run resumes from `step`.
-    `save` deletes them once the run reaches their step again.
-    """
+    """Renames checkpoints after `step`, from which a run resumes, to `step_<N>.aside`."""
     for path in list_checkpoints(folder):  # newest last, so it is the latest until then
         if step_of(path) > step:
             aside = path.with_name(f"{path.name}.aside")

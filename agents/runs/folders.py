@@ -52,9 +52,7 @@ def make(path: Path) -> Path:
 
 
 def new(name: str, folder: str | None = None, is_again: bool = False) -> Path:
-    """Returns the folder of a new run: `folder`, or one in `RUNS` that is called by the time and a
-    name. Raises as `check_free`.
-    """
+    """Returns the folder of a new run, `folder` or one in `RUNS`. Raises as `check_free`."""
     if folder is None:
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
     check_free(folder, is_again)
@@ -88,11 +86,8 @@ def write_config(folder: Path, config: "Config") -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Locks a run folder for the duration of the context, so that no other process trains in it.
-    The system releases the lock when this process ends, even by kill -9.
-
-    Raises:
-        UserError: another process, which the message names, trains in it; or it cannot be written.
+    """Locks a run folder for the context; the system releases it even after kill -9. UserError if
+    another process, which it names, trains in it, or it cannot be written.
     """
     import filelock  # slow to import
 
@@ -146,13 +141,9 @@ def pretrained() -> dict[str, Path]:
 
 
 def find(name: str, member: int | str | None = "best") -> Path:
-    """Returns the path of a run folder, a checkpoint or an agent file. Raises UserError with the
-    most similar names if there is none.
-
-    Args:
-        name: a path, `latest`, or the name of a pretrained agent; an existing path has priority.
-        member: of a population, if the path is a population's: a number, or `best`; None: the
-            population's own folder.
+    """Returns the path of a run, a checkpoint or an agent file: an existing path, `latest`, or the
+    name of a pretrained agent; of a population a member's, `best` or a number, or with None its
+    own. Raises UserError with the most similar names if there is none.
     """
     path = Path(name)
     if name == "latest" and (folders := known()):
@@ -183,15 +174,9 @@ def load_checkpoint(
     is_whole: bool = False,
     rank: int = 0,
 ) -> checkpoint.Checkpoint:
-    """Loads the latest intact checkpoint of a run, or an agent file. Warns of damaged checkpoints.
-
-    Args:
-        path: from `find`.
-        is_trusted: also allows import paths outside megastep that this user has not trained with.
-        device, is_whole, rank: as for `checkpoint.read`.
-
-    Raises:
-        UserError: there is no intact checkpoint, or `trust=true` is needed.
+    """Loads the latest intact checkpoint of a path from `find`, as `checkpoint.read` does, or an
+    agent file. UserError if there is none, or it names what this user has not trained with and is
+    not trusted.
     """
     with user_errors(kinds=(OSError, checkpoint.CheckpointError)):
         if agent_file.is_agent_file(path):
@@ -211,9 +196,7 @@ def resume_command(folder: Path, key: str = "resume") -> str:
 
 
 def command_of(script: str, key: str, folder: Path) -> str:
-    """Returns the command that does something with a run, such as `python evaluate.py run=RUN`,
-    quoted for the shell and for Hydra.
-    """
+    """Returns the command that does something with a run, quoted for the shell and for Hydra."""
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
     return f"{package.command(script, 'python ')} {shlex.quote(f'{key}={name}')}"
@@ -233,9 +216,7 @@ def checkpoints_of(path: Path) -> Path:
 
 
 def folder_of(path: Path) -> Path:
-    """Returns the run folder of a path from `find`; for an agent file a folder in `RUNS` for its
-    results, which may not exist yet.
-    """
+    """Returns the run folder of a path from `find`; for an agent file one for its results."""
     if agent_file.is_agent_file(path):
         return RUNS / f"pretrained-{path.stem}"
     if populations.is_root(path):

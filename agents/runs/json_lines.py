@@ -57,11 +57,8 @@ class JsonLines:
 
 
 def read(path: Path | str, kind: object = None) -> "list[Row]":
-    """Returns the objects in a file. Skips damaged lines with a warning, and silently a last line
-    that a crash cut short.
-
-    Args:
-        kind: of a line, from `typed_json`. UserError for others; a file that is not there has none.
+    """Returns the objects in a file, or of a kind from `typed_json`, else UserError. Skips damaged
+    lines with a warning, and silently a last line that a crash cut short.
     """
     if kind is None:
         return [row for row, _ in _intact_lines(Path(path))]
@@ -72,11 +69,8 @@ def read(path: Path | str, kind: object = None) -> "list[Row]":
 
 
 def truncate_after(path: Path | str, step: int) -> None:
-    """Removes the lines after `step` environment steps, which a resumed run writes again, and
-    damaged lines. Does nothing if the file does not exist.
-
-    Raises:
-        OSError: there is no space for a copy. The file is unchanged.
+    """Removes damaged lines and those after `step`, which a resumed run writes again. OSError, and
+    the file is unchanged, if there is no space for a copy.
     """
     path = Path(path)
     if not path.exists():

@@ -47,9 +47,7 @@ def score_of(folder: Path, ranked_by: str = RUNNING) -> float | None:
 
 
 def best(root: Path) -> int | None:
-    """Returns the number of the member with the highest score, the first of equal ones; None if no
-    member has one.
-    """
+    """Returns the number of the first member with the highest score; None if none has one."""
     ranked_by, path = RUNNING, folder_of(root, 0) / "config.yaml"
     with contextlib.suppress(KeyError, TypeError):
         ranked_by = typed_json.read_yaml(path)["population"]["score"] if path.exists() else RUNNING
@@ -62,9 +60,7 @@ def _highest(scores_of) -> int | None:
 
 
 def member(root: Path, which: "int | str" = "best") -> Path:
-    """Returns the run folder of a member, by its number or `best`. Raises UserError for others, and
-    if no member has a score.
-    """
+    """Returns the run folder of a member, by its number or `best`. UserError for others."""
     n = len(members(root))
     if (number := best(root) if which == "best" else int(which)) is None:
         text = f"No member of {root} has a score, so none is the best"
@@ -77,9 +73,8 @@ def member(root: Path, which: "int | str" = "best") -> Path:
 
 
 def common_checkpoints(root: Path) -> list[Path]:
-    """Returns the newest checkpoint of each member after one number of samples, that all of them
-    have saved whole; none if a kill left the first one to some. Raises UserError if there is none
-    for another reason.
+    """Returns each member's newest checkpoint after one number of samples, all intact; none if only
+    some have a first one. UserError if there is none for another reason.
     """
     by_step = []
     for folder in members(root):
@@ -131,9 +126,7 @@ def read(path: Path) -> "list[list[Row]]":
 
 
 def first_copy(folder: Path) -> int | None:
-    """Returns the generation in which a member first copied another; None if it never did, or if
-    no file says so.
-    """
+    """Returns the generation in which a member first copied another; None if it is not known."""
     with contextlib.suppress(UserError, ValueError, IndexError):
         number = int(folder.name.removeprefix(PREFIX))
         rows = [rows[number] for rows in read(folder.parent / FILE)]

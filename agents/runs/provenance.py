@@ -55,9 +55,7 @@ def made_with(device: torch.device, n_ranks: int = 1) -> dict[str, str | int]:
 
 
 def commit(folder: Path) -> str | None:
-    """Returns the commit of the git checkout at a folder, with `-dirty` if tracked files have
-    changed; None without a checkout or git.
-    """
+    """Returns the commit of a git checkout, `-dirty` if tracked files have changed, or None."""
     if not (folder / ".git").exists():  # megastep may be installed inside another's checkout
         return None
     # ignore a git hook's variables, if one starts this; take no lock in the user's checkout

@@ -78,16 +78,10 @@ class Saver:
     def __call__(
         self, step: int, state: StateDict, score: float | None = None, is_last: bool = False
     ) -> None:
-        """Copies `state` to the CPU and starts to write a checkpoint of it.
-
-        Args:
-            step: environment steps so far, of all lanes.
-            state: dicts and lists of tensors and plain values; may change once this returns.
-            score: such as the mean return, higher is better; None if unknown.
-            is_last: no other checkpoint follows.
-
-        Raises:
-            NonFiniteError: policy or learner have a NaN or infinity. Earlier checkpoints are kept.
+        """Copies `state` to the CPU and starts to write a checkpoint of it after so many
+        environment steps of all lanes. `score`: higher is better. `is_last`: no other follows.
+        Raises NonFiniteError if policy or learner have a NaN or infinity; earlier checkpoints are
+        kept.
         """
         if self.folder == NOWHERE:
             return
@@ -162,10 +156,8 @@ class Saver:
         self._is_given_up.set()
 
     def wait(self) -> None:
-        """Waits until the last checkpoint is written. Warns if the disk failed.
-
-        Raises:
-            Exception: any other error of the thread.
+        """Waits until the last checkpoint is written. Warns if the disk failed, and raises any
+        other error of the thread.
         """
         if self._thread is None:
             return

@@ -14,11 +14,8 @@ OTHERWISE = "env", "geometry", "greedy", "against", "max_steps"
 
 
 def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float | None:
-    """Returns the score of a training run: the mean return, or another statistic, of the episodes
-    in the last reports of its `metrics.jsonl`. None if none has one.
-
-    Each episode counts once: `episode/NAME` is a mean over a window of `episode/window` episodes,
-    which may include some of earlier reports.
+    """Returns the mean return, or another statistic, of the episodes in the last reports of
+    `metrics.jsonl`, each once although windows overlap. None if none has one.
     """
     total, n_episodes, end = 0.0, 0, len(rows)
     while end > max(0, len(rows) - n_reports):
@@ -40,12 +37,9 @@ def evaluation(file: Path) -> "Row":
 
 
 def outcome(result: Path, metric: str = "episode/return") -> dict[str, float | None]:
-    """Returns the scores of a run folder, or of the .json file of an evaluation.
-
-    `evaluated` is the metric in an evaluation (for a run, its last), such as the return, or the
-    fraction of duels won against the first opponent, `lower` and `upper` its 95 % interval; `score`
-    is a run's `mean`, or the same as `evaluated` if the metric is `eval/NAME`. Each is None if
-    unknown.
+    """Returns the scores of a run folder, or of an evaluation's .json, each None if unknown: the
+    `evaluated` metric, such as the return, or the fraction of duels won, with its 95 % interval,
+    `lower` to `upper`; and `score`, a run's `mean`, or the same if the metric is `eval/NAME`.
     """
     files, rows = [result], []
     kind, _, name = metric.partition("/")

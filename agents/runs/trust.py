@@ -61,9 +61,7 @@ def untrusted(names: Iterable[str]) -> list[str]:
 
 
 def check(config: "Config", source: object, cure: str = CURE) -> None:
-    """Raises UserError if a configuration, which `source` holds, names what may not be imported.
-    `cure` is the end of the sentence.
-    """
+    """Raises UserError if a configuration in `source` names what may not be imported."""
     names = foreign_names(config)
     if names and (names := untrusted(names)):
         raise UserError(

@@ -22,9 +22,8 @@ CHUNK = 256  # walls compared with all others at a time
 
 
 def clearance(g: dotdict, cell: float = FINE) -> np.ndarray:
-    """Returns the metres, at most 0.3, from each cell's centre on a raster to the nearest wall.
-
-    `cell` divides the side of the cells of the masks, and the raster has the masks' extent.
+    """Returns the metres, at most 0.3, from each cell's centre on a raster, of the masks' extent,
+    to the nearest wall. `cell` divides the side of the cells of the masks.
     """
     ratio = round(g.res / cell)
     height, width = (n * ratio for n in g.masks.shape)
@@ -88,15 +87,9 @@ def _crosses(ends) -> bool:
 
 
 def errors(g: dotdict, fine: float = FINE) -> list[str]:
-    """Returns a sentence for each thing that a geometry does not satisfy, none if it is sound.
-
-    A sound geometry passes `geometry.validate_geometry`; has no wall of length 0, no two that are
-    the same or cross; is closed, so that nobody can leave its rooms for the outside; lets an agent
-    reach every room from every other; and has each light indoors.
-
-    Args:
-        g: a geometry.
-        fine: metres per cell of the raster on which an agent moves.
+    """Returns a sentence for each thing that a geometry does not satisfy, none if it is sound: it
+    passes `geometry.validate_geometry`; no two walls are the same or cross; it is closed; an agent
+    can reach every room from every other, on a raster of `fine` metres; and each light is indoors.
     """
     try:
         valid = geometry.validate_geometry(dotdict(g))

@@ -107,9 +107,7 @@ def read(file: Path | IO[bytes], count: int, remedy: str, further: Sequence[str]
 
 
 def split_range(count: int, split: str) -> range:
-    """Returns the indices of a split, as a range into a database of `count` geometries. A single
-    geometry is in every split.
-    """
+    """Returns the indices of a split of `count` geometries; a single one is in every split."""
     training = count - max(1, round(count / 10)) if count > 1 else 1
     of_test = range(training if count > 1 else 0, count)
     return {"training": range(training), "test": of_test, "all": range(count)}[split]
@@ -178,9 +176,7 @@ def imported_path(name: str) -> Path:
 
 
 def write_imported(name: str, plans: Sequence[dotdict], file_numbers: Sequence[int]) -> Path:
-    """Writes the database of a source, atomically: its plans, and the number of the file that each
-    is from. Returns its path. Raises OSError if it cannot be written.
-    """
+    """Writes the database of a source, its plans and the number of each one's file. OSError."""
     content = pack(plans, zipfile.ZIP_DEFLATED, files=np.array(file_numbers, "<i4"))
     write_atomically(path := imported_path(name), content)
     return path

@@ -69,11 +69,8 @@ def _sound(g, before) -> tuple[dict, float]:
 
 
 def load(path: str | Path) -> list[dotdict]:
-    """Returns the list of geometries in an `.npz` file. Walls of length 0 are dropped.
-
-    Raises:
-        ValueError: if the file is missing, broken or too large, or if `validate_geometry` refuses a
-            geometry. The message names the file and the geometry.
+    """Returns the geometries of an `.npz` file, without walls of length 0. ValueError, naming file
+    and geometry, if the file is missing, broken or too large, or `validate_geometry` refuses one.
     """
     path, place = Path(path), ""
     if not path.is_file():
@@ -100,11 +97,8 @@ def load(path: str | Path) -> list[dotdict]:
 
 
 def save(path: str | Path, geometries: Sequence[dict]) -> None:
-    """Writes a list of geometries to an `.npz` file, atomically. Further keys are written if they
-    are numbers or arrays of numbers.
-
-    Raises:
-        ValueError: if `load` would refuse a geometry. The message names it.
+    """Writes geometries, and their further keys that are numbers, to an `.npz` file, atomically.
+    ValueError, naming it, if `load` would refuse a geometry.
     """
     path, arrays, length = Path(path), {}, 0.0
     for index, g in enumerate(geometries):

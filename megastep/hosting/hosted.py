@@ -42,14 +42,10 @@ def make_env(spec: Any, wrappers: Sequence[Callable], settings: dict) -> gymnasi
 
 
 class Hosted:
-    """N environments of A agents in this process, B = N A lanes. The step after all agents of an
-    environment have ended resets it. Arrays that are returned are valid until the next call.
-
-    A subclass has `_begin` and `_step`, which fill the rows of an environment's lanes.
-
-    Args:
-        spaces: of one lane's observation and action.
-        first: number of the first environment in messages.
+    """N environments of A agents in this process, B = N A lanes, the `first` of a number in
+    messages. The step after all agents of an environment have ended resets it. Arrays that are
+    returned are valid until the next call. A subclass has `_begin` and `_step`, which fill an
+    environment's rows.
     """
 
     HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
@@ -83,9 +79,7 @@ class Hosted:
         return self._advance(itertools.repeat(()), seed)
 
     def step(self, actions: Tree) -> tuple:
-        """Takes one step. Returns (observations, rewards, terminated, truncated, infos). Infos have
-        `action_mask`, (B, found.n_masked) bool.
-        """
+        """Takes one step. Returns (observations, rewards, terminated, truncated, infos)."""
         return self._advance(zip(*[iter(iterate(self.actions, actions))] * self.n_agents))
 
     def _advance(self, actions, seeds=None) -> tuple:
@@ -118,9 +112,7 @@ class Hosted:
         return wrapper_state(self.envs[0])
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives the wrappers of all environments the statistics of others, which stay as they are
-        if `is_frozen`. Raises ValueError if they are not in such wrappers.
-        """
+        """Gives all wrappers the statistics of others, to stay if `is_frozen`. Raises ValueError."""
         self.frozen = state if is_frozen else None
         for env in self.envs:
             load_wrapper_state(env, state)
@@ -155,12 +147,8 @@ class Hosted:
 
 
 class HostedEnvs(Hosted):
-    """N environments of Gymnasium, each with global generators of its own. Infos also have
-    `numbers`, (N, len(found.names)) of an environment's last episode, nan where there is none.
-
-    Args:
-        first: number of the first environment in messages and for its generators.
-        seed: of the global generators.
+    """N environments of Gymnasium, each with global generators of its own, of a seed. Infos also
+    have `numbers`, (N, len(found.names)) of an environment's last episode, nan where there is none.
     """
 
     def __init__(
@@ -214,12 +202,7 @@ class HostedEnvs(Hosted):
 
 class ParallelEnvs(Hosted):
     """N parallel environments of PettingZoo, with a row per agent, or turn-based ones that it can
-    convert.
-
-    Attributes:
-        present: (B,) bool, agents that act in the next step, also in infos. An agent is not if the
-            reset left it out or its episode has ended, until it is among the environment's agents
-            again.
+    convert. `present`, (B,) bool, also in infos, are agents that act in the next step.
     """
 
     def __init__(

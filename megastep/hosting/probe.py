@@ -132,9 +132,7 @@ def wrapper_state(env: Any) -> Tree:
 
 
 def load_wrapper_state(env: Any, state: Tree) -> None:
-    """Puts a `wrapper_state`, which may be a stranger's, into the wrappers of another environment.
-    Raises ValueError if it is not in such wrappers.
-    """
+    """Puts a `wrapper_state`, which may be a stranger's, into other wrappers. ValueError."""
     owners = _statistics(env)
     for path, value in state.items():
         place, _, part = path.rpartition(".")

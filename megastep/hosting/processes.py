@@ -81,9 +81,7 @@ class VectorProcesses:
         return [frame for frames in self._ask("render") for frame in frames]
 
     def wrapper_state(self) -> Tree:
-        """Returns what the wrappers of the first environment have learnt, by path; of a process
-        that has ended, what it was at the last call.
-        """
+        """Returns what the first environment's wrappers have learnt, by path, as last known."""
         with contextlib.suppress(EnvError, MemoryError):
             (self.latest_state,) = self._ask("wrapper_state", n_processes=1)
         return self.latest_state
@@ -92,9 +90,7 @@ class VectorProcesses:
         self._ask("load_wrapper_state", state=state, is_frozen=is_frozen)
 
     def close(self) -> None:
-        """Closes the environments and ends their processes, by force after `PATIENCE` seconds.
-        Raises the first EnvError.
-        """
+        """Closes the environments and ends their processes. Raises the first EnvError."""
         answers, pipes, end = [], [*self.pipes], time.monotonic() + PATIENCE
         for pipe in pipes:
             with contextlib.suppress(EOFError, OSError):  # it has ended

@@ -106,23 +106,17 @@ class VectorizedEnv:
         return self._world(*self._call(self.vector.step, self._write(chosen)))
 
     def wrapper_state(self) -> Tree:
-        """Returns what the wrappers of an environment have learnt, such as running statistics, as
-        tensors and numbers by path.
-        """
+        """Returns what the wrappers of an environment have learnt, tensors and numbers by path."""
         return {path: _plain(value) for path, value in self.vector.wrapper_state().items()}
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives the wrappers of all environments what those of others have learnt, which stays as
-        it is if it `is_frozen`. Raises ValueError if they are not in such wrappers.
-        """
+        """Gives all wrappers what others have learnt, to stay if it `is_frozen`. ValueError."""
         tensors = {p: x.cpu().numpy() for p, x in state.items() if isinstance(x, torch.Tensor)}
         self.vector.load_wrapper_state({**state, **tensors}, is_frozen)
 
     @functools.cached_property
     def resumable(self) -> bool:
-        """False if checkpoints cannot hold the environments: those in other processes, and those
-        whose state is not in Python, such as Box2D's.
-        """
+        """False for other processes, and state that is not in Python, such as Box2D's."""
         return not hasattr(self.vector, "processes") and not EnvState(self).unreachable()
 
     def close(self) -> None:
@@ -130,9 +124,7 @@ class VectorizedEnv:
         self._call(self.vector.close)
 
     def state(self, e: int = 0) -> arrdict:
-        """Returns the frame of environment ``e``, (H, W, 3) uint8, as the environment renders it.
-        Raises ValueError if it renders no images.
-        """
+        """Returns the frame of environment ``e``, (H, W, 3) uint8. ValueError if it has none."""
         from megastep.video import as_image  # with Pillow, which stepping does without
 
         self._call(self.vector.start_rendering)

@@ -31,11 +31,8 @@ KEYS = {"a": 1, "ArrowUp": 3, "d": 2, "ArrowLeft": 5, "ArrowDown": 4, "ArrowRigh
 
 
 def module(program: Program) -> bytes:
-    """Returns a WebAssembly module with the operations of a program: the one that comes with
-    megastep if it has them, or one that clang builds now.
-
-    Raises:
-        EngineError: it has to be built, and that fails.
+    """Returns the WebAssembly module that comes with megastep, if it has a program's operations, or
+    one that clang builds now. EngineError if that fails.
     """
     shipped = SHIPPED.read_bytes() if SHIPPED.exists() else b""
     keys, operations = wasm_keys(shipped) if shipped else {}, program.operations()
@@ -51,12 +48,9 @@ def module(program: Program) -> bytes:
 
 
 def page(program: Program, about: Mapping, code: bytes) -> str:
-    """Returns an HTML page that plays a program.
-
-    Args:
-        program: with the sections `reset` and `step`, and those of the policies in ``about``.
-        about: what the page shows: `scene`, title, about, policies and seed.
-        code: the WebAssembly module.
+    """Returns an HTML page that plays a program, of a WebAssembly module, with the sections
+    `reset`, `step` and those of policies. ``about`` is what it shows: `scene`, title, about,
+    policies and seed.
     """
     buffers, parts, size = [], [], 0
     for buffer in program.buffers:
@@ -155,9 +149,7 @@ def _themes() -> str:
 
 
 def controls(env: Env) -> Mapping[str, object]:
-    """Returns {key of a keyboard: action} of one lane: the environment's ``controls``, movement by
-    arrow keys, or digits.
-    """
+    """Returns {key of a keyboard: action}: the environment's own, movement, or digits."""
     own, space, moves = optional(env, "controls"), env.action_space, hasattr(env, "movement")
     if own is not None:
         return dict(own)
@@ -167,11 +159,8 @@ def controls(env: Env) -> Mapping[str, object]:
 
 
 def scene(env: Env, program: Program, homes: Sequence[str] = ()) -> dict:
-    """Returns what a page shows of an environment: JSON's types.
-
-    Args:
-        program: the recorded environment.
-        homes: names of the floor plans, in the order of the layouts.
+    """Returns what a page shows of a recorded environment with floor plans of some names, as JSON's
+    types.
     """
     shown: dict = {
         "env": type(env).__name__,

@@ -201,16 +201,9 @@ class Recorder:
 
 
 def record(env: Env) -> Program:
-    """Returns an environment as a program with the sections `reset` and `step`.
-
-    Changes the environment: it is reset and stepped with random actions. A replay is compared with
-    it, every output and all that steps change.
-
-    Args:
-        env: on a CPU, with one tensor of actions.
-
-    Raises:
-        ValueError: what kernels compute is not all that a step does.
+    """Returns an environment on a CPU as a program with the sections `reset` and `step`. It is
+    reset and stepped with random actions, and a replay is compared with it: ValueError if what
+    kernels compute is not all that a step does.
     """
     recorder, generator = Recorder(env), torch.Generator().manual_seed(1)
     if isinstance(env.action_space, dict):

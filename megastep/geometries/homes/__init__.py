@@ -43,10 +43,8 @@ def _attempt(count, generator, style) -> list[tuple]:
 
 
 def _best_plan(generator, style) -> tuple:
-    """Returns the best of a few plans: (cost, footprint, rooms, contacts, depth, gaps).
-
-    The number of rooms is drawn once. Plans of few rooms succeed more often, so drawing it again
-    after each failure would make homes too small.
+    """Returns the best of a few plans of one number of rooms, as drawing that again after a failure
+    would make homes too small: (cost, footprint, rooms, contacts, depth, gaps).
     """
     count, plans = plan.room_count(generator, style), []
     while not plans:

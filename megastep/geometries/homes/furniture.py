@@ -169,14 +169,9 @@ def furnish(
     style: Style,
     generator: PortableGenerator,
 ) -> regions.Region:
-    """Draws the furniture of a room: disjoint rectangles, of which an L-shape has two.
-
-    Args:
-        solids: the walls of the home.
-        keep_clear: where nothing may stand, such as in front of doors.
-        doorways: parts of the home's doorways, outside of rooms, that clutter blocks.
-        style: how many pieces, and which fraction of them is clutter. Those that find no place
-            are left out.
+    """Draws the furniture of a room between solid walls: disjoint rectangles, of which an L-shape
+    has two, off what is to be kept clear. The style says how many pieces, and which fraction of
+    them is clutter, which blocks parts of doorways. Those that find no place are left out.
     """
     is_walled, floor = _walled(region), _floor(region, solids)
     x0, y0, x1, y1 = floor

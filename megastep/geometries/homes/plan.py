@@ -37,9 +37,7 @@ class Style(NamedTuple):
 
 
 def style(density: float, clutter: float = 0.0) -> Style:
-    """Returns the style of a density from 1, as real homes have, to `DENSEST`, and a clutter from
-    0 to 1.
-    """
+    """Returns the style of a density, from 1 to `DENSEST`, and a clutter from 0 to 1."""
     t = (density - 1) / (DENSEST - 1)
     return Style(
         rooms=1 + 0.55 * t,
@@ -139,9 +137,7 @@ def _apart(a, b) -> int:
 
 
 def footprint(total: int, generator: PortableGenerator) -> regions.Region:
-    """Draws the inner outline of a home whose rooms have `total` cm2: a box less up to three
-    notches.
-    """
+    """Draws the inner outline of a home with `total` cm2 of rooms: a box less some notches."""
     aspect = min(max(generator.lognormal(MEDIAN_ASPECT, SIGMA_ASPECT), 1.0), MAX_ASPECT)
     fractions = [generator.uniform(0.03, 0.15) for _ in range(generator.pick(NOTCHES))]
     left = 1.0
@@ -207,10 +203,8 @@ def partition(
     generator: PortableGenerator,
     style: Style,
 ) -> tuple[list[Room], dict] | None:
-    """Lays out rooms, a list of (kind, area in cm2), in a region.
-
-    Returns ([Room], {(axis, at): side}): the rooms, and for the line of each cut the side of it on
-    which the wall stands; None if no partition is found in STEPS cuts.
+    """Lays out rooms, (kind, area in cm2) each, in a region. Returns ([Room], {(axis, at): side of
+    a cut on which the wall stands}), or None if none is found in STEPS cuts.
     """
     keys = [KINDS[kind].order + generator.normal(0.0, 0.8) for kind, _ in rooms]
     ordered = [rooms[i] for _, i in sorted(zip(keys, range(len(rooms))))]

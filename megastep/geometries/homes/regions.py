@@ -63,9 +63,7 @@ def position(slices: list[tuple[int, int, int]], area_below: int) -> int:
 
 
 def corners(region: Region, axis: int) -> dict[int, int]:
-    """Returns {line: side} of the lines through the region's inner corners. The outside is on side
-    -1 (below) or +1 (above).
-    """
+    """Returns {line: outside's side, -1 (below) or +1} of lines through the inner corners."""
     if len(region) == 1:
         return {}
     low, high = bounds(region)[axis::2]

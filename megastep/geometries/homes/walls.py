@@ -118,10 +118,8 @@ def _cost(*kinds) -> float:
 def connections(
     rooms: Sequence[Room], spans: dict[Contact, tuple[int, int]], generator: PortableGenerator
 ) -> tuple[float, list[Contact]] | None:
-    """Chooses the contacts to open: a cheapest spanning tree of the rooms, and some loops.
-
-    `spans` has the clear (low, high) of every contact. Returns (mean cost of the tree, [contact]),
-    or None if no tree reaches every room.
+    """Chooses the contacts to open, by their clear spans: a cheapest spanning tree of the rooms,
+    and loops. Returns (mean cost of the tree, [contact]), None if no tree reaches all.
     """
     longest = {}
     for contact, (low, high) in spans.items():
@@ -258,9 +256,7 @@ def paint(
 
 def _faces(lines, along, cells, beside) -> np.ndarray:
     """Returns the longest segments between rows with a wall on one side and the state `beside` on
-    the other: (n, 2, 2) of (along, line).
-
-    A face with the wall above it is never joined to one with the wall below it.
+    the other: (n, 2, 2) of (along, line). Faces of different sides are not joined.
     """
     padded = np.pad(cells, ((1, 1), (0, 0)))
     low, high = padded[:-1], padded[1:]
@@ -273,9 +269,7 @@ def _faces(lines, along, cells, beside) -> np.ndarray:
 
 
 def segments(xs: np.ndarray, ys: np.ndarray, cells: np.ndarray, beside: int) -> np.ndarray:
-    """Returns all segments (n, 2, 2) of (x, y) between walls and cells in the state `beside`.
-    Collinear ones are joined.
-    """
+    """Returns the segments (n, 2, 2) of (x, y) between walls and cells of a state, joined."""
     level = _faces(ys, xs, cells, beside)
     upright = _faces(xs, ys, cells.T, beside)[..., ::-1]
     return np.concatenate([level, upright])
@@ -347,9 +341,7 @@ def slanted(
 
 
 def cut_off(lines: np.ndarray, triangle: list) -> np.ndarray:
-    """Cuts back the two segments that end in the triangle's first corner, and adds one between
-    their new ends.
-    """
+    """Cuts back the two segments at the triangle's first corner, and joins their new ends."""
     corner, (x, _), (_, y) = triangle
     lines = lines.copy()
     for line in lines:

@@ -48,9 +48,7 @@ class Map(NamedTuple):
 
 
 def load(path: Path, metres_per_pixel: float | None = None) -> Map:
-    """Returns the map of a ROS `.yaml`, as map_server reads it, or of an image if
-    `metres_per_pixel` is given. Raises ValueError.
-    """
+    """Returns the map of a ROS `.yaml`, or of an image and its metres per pixel. ValueError."""
     if path.suffix.lower() not in (".yaml", ".yml"):
         if metres_per_pixel is None:
             raise ValueError("an image needs metres_per_pixel=, such as 0.02")

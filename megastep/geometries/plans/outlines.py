@@ -65,9 +65,7 @@ def ring(points: np.ndarray) -> list[Polygon]:
 
 
 def check_meetings(shapes: Sequence[BaseGeometry], before: int = 0) -> int:
-    """Returns `before` and how often the boxes around segments meet. Raises ValueError if that is
-    so often that areas would take minutes.
-    """
+    """Returns `before` and how often boxes of segments meet. ValueError if minutes too often."""
     points, of_shape = shapely.get_coordinates(shapes, return_index=True)
     segments = np.stack([points[:-1], points[1:]], 1)[of_shape[:-1] == of_shape[1:]]
     boxes = shapely.box(*segments.min(1).T, *segments.max(1).T)

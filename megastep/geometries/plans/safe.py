@@ -31,9 +31,7 @@ class Member(NamedTuple):
 
 
 def members(path: Path, suffix: str) -> Iterator[Member]:
-    """Yields the files of a folder whose names end in `suffix`, or the file itself. Raises
-    ValueError if there is no such file, or it is an archive.
-    """
+    """Yields the files of a folder with a suffix, or the file. ValueError for an archive."""
     if path.is_dir():
         files = (file for file in sorted(path.rglob(f"*{suffix}")) if file.is_file())
         yield from (of_file(file, file.relative_to(path).as_posix()) for file in files)

@@ -37,11 +37,7 @@ def _draw(drawing, ax) -> None:
 def write(
     path: Path, pairs: Sequence[tuple[str, Drawing | np.ndarray, dotdict]], columns: int = COLUMNS
 ) -> None:
-    """Writes a sheet of (title, drawing or image, geometry), `columns` in a row, as an image.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Writes a sheet of (title, drawing or image, geometry) as an image. Raises OSError."""
     columns = min(columns, len(pairs))
     rows = -(-len(pairs) // columns)
     figure = Figure(figsize=(6.4 * columns, 3.4 * rows), layout="constrained")

@@ -77,14 +77,10 @@ class _Place(NamedTuple):
 def read(
     content: bytes, scale: float, walls: str = "wall", doors: str = "door"
 ) -> tuple[Drawing, list[str]]:
-    """Returns the drawing of an SVG, and what of it is not read. Raises ValueError.
-
-    Args:
-        content: of the file.
-        scale: metres per unit of the SVG, after all transforms.
-        walls: the mark of walls: an id, perhaps followed by a number, a word of the class, or a
-            label of Inkscape or Illustrator.
-        doors: the mark of doors, in gaps of the walls or upon them.
+    """Returns the drawing of an SVG, `scale` metres per unit after all transforms, and what of it
+    is not read. Walls, and doors in gaps of these or upon them, have a mark: an id, perhaps
+    followed by a number, a word of the class, or a label of Inkscape or Illustrator. Raises
+    ValueError.
     """
     reader = _Reader(safe.svg(content), scale, {"walls": walls, "doors": doors})
     if not reader.shapes["walls"]:
