@@ -114,9 +114,7 @@ class Run:
         return record(self, **settings)
 
     def export(self, format: str, file: "str | os.PathLike | None" = None) -> Path:
-        """Writes the agent as "onnx", "torch" or "safetensors", by default into the run's folder.
-        Returns the path.
-        """
+        """Writes the agent as "onnx", "torch" or "safetensors". Returns the path."""
         from megastep.agents.cli import export
 
         return export.COMMAND.call(_plain(dict(run=self, format=format, file=file), "settings"))
@@ -227,16 +225,14 @@ def record(
 
 def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
     """Writes a policy that a loop of your own has trained as an agent's file, with a card beside
-    it. Returns it as a run: `evaluate`, `record`, `init=` and `against=` take the file.
+    it. Returns it as a run: `evaluate`, `record`, `init=` and `against=` take the file. Raises
+    UserError: the policy or the environment is another, a weight is too large, or the file cannot
+    be written.
 
     Args:
         policy: a `megastep.agents.networks.policy.Policy`; its weights are rounded to float16.
         env: from `make`, in which it acts. Its settings are kept, and what wrappers have learnt.
         file: NAME.safetensors.
-
-    Raises:
-        UserError: the policy or the environment is another, a weight is too large, or the file
-            cannot be written.
     """
     from megastep.agents.export import agent  # with PyTorch
     from megastep.agents.networks.policy import Policy
@@ -266,8 +262,8 @@ def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
 
 
 def load(run: "Run | str | os.PathLike") -> Run:
-    """Returns a run by its folder, a checkpoint of it, `latest`, or the name of a packaged agent.
-    Raises UserError with the most similar name if there is none.
+    """Returns a run by its folder, a checkpoint, `latest`, or the name of a packaged agent.
+    UserError.
     """
     return run if isinstance(run, Run) else Run(folders.find(os.fspath(run)))
 

@@ -26,7 +26,7 @@ DIGEST = 32  # bytes
 
 
 def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
-    """Returns a file's content, made by ``build`` if need be, and its path, None without a cache."""
+    """Returns a file's content, made by ``build`` if need be, and its path, None if uncached."""
     path = _folder() / name
     if problem := _problem(path.parent):
         warn(problem)

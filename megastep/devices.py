@@ -19,9 +19,7 @@ _n_threads = None  # None: as many as PyTorch
 
 
 def device(name: str | torch.device = "auto") -> torch.device:
-    """Returns a device by name: auto (a GPU if there is one, else the CPU), cpu, cuda or cuda:1.
-    Raises EngineError if there is none.
-    """
+    """Returns a device: auto (a GPU if there is one), cpu, cuda or cuda:1. EngineError if none."""
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "auto":
         return torch.device("cuda", torch.cuda.current_device()) if count else torch.device("cpu")
@@ -65,9 +63,7 @@ def _warn_of_spinning() -> None:
 
 
 def set_threads(n: int | None) -> None:
-    """Sets the number of CPU threads per operation, from 1 to 1,024, or to the number of processors
-    if that is more; None means as many as PyTorch uses.
-    """
+    """Sets the CPU threads per operation, 1 to `MAX_THREADS`; None: as many as PyTorch uses."""
     global _n_threads
     if n is not None and (type(n) is not int or not 1 <= n <= MAX_THREADS):
         raise ValueError(f"n must be an integer from 1 to {MAX_THREADS}, but {n!r} was given")

@@ -120,7 +120,8 @@ def _inside(rings, shape) -> np.ndarray:
 def masks(
     walls: ArrayLike, rooms: Sequence, res: float = RES, extent: ArrayLike = (0, 0)
 ) -> np.ndarray:
-    """Returns the masks of a geometry, (H, W) int16.
+    """Returns the masks of a geometry, (H, W) int16. Raises ValueError if a wall reaches beyond 200
+    m.
 
     A room holds the cells whose centre it contains. Walls take every cell that they touch, even at
     its edge. Where rooms overlap, the later one wins.
@@ -131,9 +132,6 @@ def masks(
             are holes. The first room is number 1.
         res: the side of a cell in metres.
         extent: (x, y) in metres that the masks reach at least, where no wall is.
-
-    Raises:
-        ValueError: if a wall reaches beyond 200 m.
     """
     walls = np.asarray(walls, np.float64).reshape(-1, 2, 2)
     reach = np.concatenate([walls.reshape(-1, 2), np.reshape(extent, (1, 2))]).max(0)
@@ -190,11 +188,9 @@ def _coordinates(g, key, shape, limit) -> np.ndarray:
 
 
 def validate_geometry(g: G) -> G:
-    """Returns a copy of a geometry with the documented dtypes and without walls of length 0.
-
-    Raises:
-        ValueError: if a number is not finite or not above 0, if there is no wall or no room, or if
-            the geometry exceeds a limit at the head of this file.
+    """Returns a copy of a geometry with the documented dtypes and without walls of length 0. Raises
+    ValueError if a number is not finite or not above 0, if there is no wall or no room, or if the
+    geometry exceeds a limit at the head of this file.
     """
     walls = _coordinates(g, "walls", (None, 2, 2), MAX_WALLS)
     walls = walls[(walls[:, 0] != walls[:, 1]).any(-1)]

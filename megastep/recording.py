@@ -52,6 +52,8 @@ MAX_RETURNS = 4  # of as many agents, one by one
 class ParallelEncoder:
     """Draws states as frames of a video. Inside its ``with`` block, call it with a state, or
     :meth:`frame` with a finished image; after the block, use :meth:`save` or :meth:`notebook`.
+    Raises RuntimeError: a frame could not be drawn; names the first such frame. Raised by any
+    method.
 
     Args:
         plot_state: takes a numpyified state, returns a matplotlib figure or an (H, W, 3) uint8
@@ -59,9 +61,6 @@ class ParallelEncoder:
         fps: frames per second. Where they are more than the format can show, 50 in a GIF and 120
             in an mp4, every second or third is drawn alone, and the video takes as long.
         format: mp4 or gif.
-
-    Raises:
-        RuntimeError: a frame could not be drawn; names the first such frame. Raised by any method.
     """
 
     def __init__(self, plot_state: Callable, fps: float = 20, format: str = "mp4"):

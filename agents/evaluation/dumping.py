@@ -44,10 +44,8 @@ STAGED = "episodes"
 
 
 def run(cfg: settings.Dump) -> Path:
-    """Writes a dataset, or what is missing of it. Returns its folder.
-
-    Raises:
-        UserError: the folder has other files, or the disk is too small; nothing is half-written.
+    """Writes a dataset, or what is missing of it. Returns its folder. Raises UserError: the folder
+    has other files, or the disk is too small; nothing is half-written.
     """
     folder, device = Path(cfg.folder), factory.make_device(cfg.device)
     if cfg.format != "npz":
@@ -170,12 +168,7 @@ class _Actor:
 
 
 class Waves:
-    """Plays and writes the episodes of a dump.
-
-    Attributes:
-        n_steps: steps written so far.
-        seconds: that took.
-    """
+    """Plays and writes the episodes of a dump: `n_steps` so far, in so many `seconds`."""
 
     def __init__(
         self,

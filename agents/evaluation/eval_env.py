@@ -99,9 +99,7 @@ class EvalEnv:
     def players(
         self, names: Sequence[str], run: checkpoint.Checkpoint, trust: bool
     ) -> list[Player]:
-        """Returns who is to play in the environment, see `find_player`. Those of equal names have
-        what was given for them beside it.
-        """
+        """Returns who is to play, see `find_player`. Equal names have what was given beside."""
         names = [*dict.fromkeys(names)]
         found = [find_player(name, run, self.settings, self.sample, trust) for name in names]
         counts = collections.Counter(player.name for player in found)
@@ -115,9 +113,8 @@ class EvalEnv:
         ]
 
     def begin(self, run: checkpoint.Checkpoint, *players: Player) -> list[PolicyLike]:
-        """Returns the policies of players in the environment, which is as it was when it was made,
-        and whose wrappers know what those of the first player's run had learnt, of a bot those of
-        `run`.
+        """Returns the policies of players in the environment, as it was when it was made, whose
+        wrappers know what the first player's run had learnt, of a bot what `run` had.
         """
         policies = [player.policy for player in players]
         if not self._is_used:
@@ -172,9 +169,7 @@ def name_of(loaded: checkpoint.Checkpoint) -> str:
 
 
 def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpoint) -> Player:
-    """Returns the player of a checkpoint, to meet the agent of `run` in `env`. Raises UserError if
-    one was trained in another environment.
-    """
+    """Returns the player of a checkpoint, to meet the agent of `run` in `env`, or UserError."""
     trained, own = (settings.label(factory.config_of(one).env.name) for one in (loaded, run))
     if trained != own:
         raise UserError(
@@ -192,15 +187,13 @@ def is_bot(name: str) -> bool:
 def find_player(
     name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Env, trust: bool
 ) -> Player:
-    """Returns who is to meet the agent of `run` in `env`, or to be compared with it there.
+    """Returns who is to meet the agent of `run` in `env`, or to be compared with it there. Raises
+    UserError if this player cannot play there.
 
     Args:
         name: a run's folder or checkpoint, or a pretrained agent; or what needs no weights: an
             import path, one of `BOTS`, or `bot`, the environment's own.
         trust: import what a run that another user made names.
-
-    Raises:
-        UserError: if this player cannot play there.
     """
     if is_bot(name):
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))

@@ -19,10 +19,8 @@ from megastep.types import PolicyLike, optional
 
 def run(cfg: settings.Record) -> Path:
     """Films agents of runs, or random actions. Returns the path of the video: `cfg.file`, or the
-    first free name of `video.mp4`, `video-2.mp4`, ...
-
-    Raises:
-        UserError: it cannot be made. No file is left.
+    first free name of `video.mp4`, `video-2.mp4`, ... Raises UserError: it cannot be made. No file
+    is left.
     """
     folder, device = Path(), factory.make_device(cfg.device)
     env_settings, geometry = cfg.env, cfg.geometry

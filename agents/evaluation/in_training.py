@@ -24,16 +24,14 @@ if TYPE_CHECKING:
 class Evaluations:
     """A callback that evaluates the policy for some reports, in unseen homes. A checkpoint follows,
     whose score is the return. Each time plays the same episodes, where the environment can be set
-    back, and neither changes anything of the training nor counts as its time.
+    back, and neither changes anything of the training nor counts as its time. Raises ConfigErrors:
+    `cfg.evaluation.stop` names what no evaluation measures.
 
     Args:
         cfg: settings of the run.
         trained_in: the environment of the training, whose wrappers may have learnt something.
         device: where to play.
         ranks: those that train the policy, which share the episodes.
-
-    Raises:
-        ConfigErrors: `cfg.evaluation.stop` names what no evaluation measures.
     """
 
     def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device, ranks: "Ranks"):

@@ -70,9 +70,8 @@ def step_until(
 
 
 def can_capture(env: Env, policies: Sequence[PolicyLike]) -> bool:
-    """Returns whether steps of these may be replayed as a CUDA graph: all are `capturable`. Unless
-    it says otherwise, a policy is if its class is megastep's, since others may keep a state where
-    no graph sees it.
+    """Returns whether steps of these may be replayed as a CUDA graph: all are `capturable`, by
+    default policies of megastep's classes, since others may keep a state where no graph sees it.
     """
     return optional(env, "capturable") and all(
         getattr(policy, "capturable", type(policy).__module__.startswith("megastep."))
@@ -160,9 +159,7 @@ def first_episodes(
 def duel_policy(
     policy: PolicyLike, opponent: PolicyLike, slots: torch.Tensor, n_agents: int
 ) -> MixedPolicy:
-    """Returns a policy that is `policy` in one slot per environment, of (N, 1) int64, and
-    `opponent` in the others.
-    """
+    """Returns a policy that is `policy` in slots (N, 1) int64, and `opponent` in all others."""
     in_slot = torch.zeros(len(slots), n_agents, dtype=torch.bool, device=slots.device)
     in_slot = in_slot.scatter(1, slots, True).flatten()
     lanes = torch.arange(len(in_slot), device=slots.device)

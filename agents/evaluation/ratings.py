@@ -86,10 +86,8 @@ def write(
 
 
 def rate(n_players: int, scores: Scores, seed: int = 1) -> list[tuple[float, float]]:
-    """Returns the rating (mean, standard deviation) of each player.
-
-    The model updates ratings duel by duel, so they depend on the order of the duels. The result is
-    the mean over `N_ORDERS` random orders.
+    """Returns the rating (mean, standard deviation) of each player, a mean over `N_ORDERS` random
+    orders of the duels, as the model updates ratings duel by duel.
     """
     from openskill.models import PlackettLuce
 

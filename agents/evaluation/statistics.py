@@ -144,9 +144,7 @@ def _interval(name, values, groups) -> dict[str, float]:
 
 
 def difference(played: Mapping, other: Mapping) -> arrdict:
-    """Returns the episodes of one player less those of another that began alike, as `summaries`
-    takes them: the interval of the mean difference is that of pairs.
-    """
+    """Returns the episodes of one player less those of another that began alike, as pairs."""
     pairs = arrdict(played, done=played["done"] & other["done"])
     for name in ("returns", "lengths", "metrics"):
         pairs[name] = played[name] - other[name]

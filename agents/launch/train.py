@@ -38,7 +38,7 @@ def run(cfg: settings.Train) -> Path | None:
 
 
 def run_rank() -> int:
-    """Trains as one of the ranks of `launcher`. Returns the exit code: 0 if it said how it ended."""
+    """Trains as one of the ranks of `launcher`. Returns the exit code: 0 if it says how."""
     facts = typed_json.loads(Path(os.environ[endings.JOB], endings.SETTINGS).read_text())
     sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
     workers.end_with_parent(facts["parent"])

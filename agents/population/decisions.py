@@ -23,9 +23,7 @@ class Decision(NamedTuple):
 
 
 def member_seed(seed: int, member: int) -> int:
-    """Returns the seed of a member's run: the population's for member 0, for each other one of its
-    own, below 2**31 as NumPy and environments of others want it.
-    """
+    """Returns the seed of a member's run: for others than 0 one of its own, below 2**31."""
     return seed if member == 0 else stream_seed(seed, f"member {member}") % 2**31
 
 
@@ -69,9 +67,7 @@ def decide(
 
 
 def order(decisions: Sequence[Decision], scores: Sequence[float | None]) -> list[int]:
-    """Returns the members that copy, in an order in which each is copied before it copies: the
-    worst first, as each copies a better one.
-    """
+    """Returns the members that copy, each copied before it copies: the worst first."""
     copying = [n for n, one in enumerate(decisions) if one.source != n]
     return sorted(copying, key=lambda n: (_score(scores[n]), n))
 

@@ -48,9 +48,7 @@ N_PREPARING = {"cpu": 1, "cuda": 3}
 
 
 class AgentParts(NamedTuple):
-    """What a member has learnt: its policy, its learner, and what wrappers of its environment have
-    learnt, if anything.
-    """
+    """What a member has learnt: policy, learner, and wrappers of its environment."""
 
     policy: Policy
     learner: Learner

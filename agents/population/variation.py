@@ -52,9 +52,7 @@ class Variation:
         return generator.uniform(least, most)
 
     def near(self, number: float, generator: random.Random) -> float:
-        """Returns a number near another: one of `FACTORS` times it, within the bounds; of choices
-        the one before or after it.
-        """
+        """Returns one of `FACTORS` times a number, within the bounds; of choices a neighbour."""
         if self.choices:
             place = self.choices.index(number) + generator.choice((-1, 1))
             return float(self.choices[min(max(place, 0), len(self.choices) - 1)])

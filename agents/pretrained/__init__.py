@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 
 def load(name: str, device: str = "auto") -> "Policy":
-    """Returns a trained policy, ready to act: `decision, state = policy(world, state)`.
+    """Returns a trained policy, ready to act: `decision, state = policy(world, state)`. Raises
+    UserError: there is none; or it names modules outside megastep that you have not trained with
+    here.
 
     It acts only: it has no critic, and its weights need no gradient. On a CPU this sets the number
     of threads that PyTorch uses, as training does.
@@ -23,10 +25,6 @@ def load(name: str, device: str = "auto") -> "Policy":
         name: of an agent; or the path of such a file, a run's folder or a checkpoint, or `latest`.
             A path comes first.
         device: `auto`, `cpu`, `cuda` or `cuda:1`; `auto` is a GPU if there is one.
-
-    Raises:
-        UserError: there is none; or it names modules outside megastep that you have not trained
-            with here.
     """
     where = make_device(device)
     loaded = folders.load_checkpoint(folders.find(name), False, where)

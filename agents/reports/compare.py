@@ -33,17 +33,15 @@ def write(
 ) -> Path:
     """Draws a metric over samples, a line per group of runs that differ in their seeds alone, with
     a 95 % bootstrap interval over seeds. Prints the interquartile means, and writes the plot and,
-    beside it, a .csv of its lines. Returns the plot's path.
+    beside it, a .csv of its lines. Returns the plot's path. Raises UserError: a folder is not a
+    run, a run has not reported the metric, there are more or fewer labels than lines, matplotlib
+    fails, or a file cannot be written.
 
     Args:
         metric: a key of `metrics.jsonl`; `eval/NAME` of `evaluations/` as well.
         labels: of the lines, in the order of their runs. Default: the settings that differ.
         ylabel: default: the metric.
         legend: a place of matplotlib's, such as `upper-left`, or `none`.
-
-    Raises:
-        UserError: a folder is not a run, a run has not reported the metric, there are more or fewer
-            labels than lines, matplotlib fails, or a file cannot be written.
     """
     with user_errors("drawing needs matplotlib, which fails: ", (ImportError, ValueError)):
         from matplotlib.figure import Figure  # which takes a while

@@ -37,9 +37,7 @@ class Run(NamedTuple):
         return {k: v for k, v in leaves(self.config) if k.split(".")[0] not in OF_A_SEED}
 
     def score(self, metric: str = "episode/return") -> float | None:
-        """Returns the mean of a metric over the last reports, of returns weighted by episodes; of
-        evaluations the last.
-        """
+        """Returns a metric's mean over the last reports; of evaluations the last."""
         if metric == "episode/return":
             return scores.mean(self.metrics)
         values = self.curve(metric)[1][-1 if metric.startswith("eval/") else -10 :]
@@ -47,9 +45,7 @@ class Run(NamedTuple):
 
     @property
     def is_interrupted(self) -> bool:
-        """Whether less than 90 % of each budget was spent, and no `evaluation.stop` can have ended
-        the run.
-        """
+        """Whether less than 90 % of each budget was spent, and nothing else ended the run."""
         done = []
         for name, rows in {"samples": self.metrics, "perf/seconds": self.perf}.items():
             budget, spent = self.config.get(name.removeprefix("perf/")), rows and rows[-1].get(name)
@@ -105,9 +101,7 @@ def read(folder: Path) -> Run:
 
 
 def expanded(names: Sequence[str]) -> list[Path]:
-    """Returns the run folders that names stand for: runs, `latest`, and folders of sweeps, which
-    stand for all of their jobs. Raises UserError for other names.
-    """
+    """Returns the run folders of names: runs, `latest`, sweeps with all jobs. UserError if not."""
     paths = []
     for name in names:
         jobs = sorted(file.parent for file in Path(name).glob("*/metrics.jsonl"))
@@ -137,9 +131,7 @@ def groups_of(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def without_interrupted(groups: dict[str, list[Run]]) -> tuple[dict[str, list[Run]], list[str]]:
-    """Returns groups without their interrupted runs, unless all of a group are, and a sentence for
-    each that is left out.
-    """
+    """Returns groups without interrupted runs, unless all are, and a sentence for each left out."""
     kept, sentences = {}, []
     for name, group in groups.items():
         kept[name] = [run for run in group if not run.is_interrupted] or group

@@ -15,9 +15,7 @@ from megastep.agents.evaluation.statistics import bounds, resamples
 
 
 def iqm(scores: ArrayLike) -> float:
-    """Returns the interquartile mean: of the middle half of all scores, of any shape. A quarter of
-    them, rounded down, is left out at either end.
-    """
+    """Returns the interquartile mean, of the middle half of all scores, of any shape."""
     return float(stats.trim_mean(np.ravel(scores), 0.25))
 
 
@@ -55,9 +53,7 @@ def pooled(scores: Mapping[str, Sequence[float]]) -> list[list[str]]:
 
 
 def profile(scores: Sequence[ArrayLike], thresholds: ArrayLike) -> np.ndarray:
-    """Returns the performance profile, (K,): the fraction of runs whose score exceeds each of K
-    thresholds, averaged over tasks.
-    """
+    """Returns the fraction of runs above each of K thresholds, averaged over tasks, (K,)."""
     limits = np.asarray(thresholds, float)[:, None]
     return np.mean([(np.asarray(task, float) > limits).mean(1) for task in scores], 0)
 

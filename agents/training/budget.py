@@ -111,9 +111,7 @@ class Stopwatch:
 
 
 def read_record(folder: Path | str) -> array:
-    """Returns the factor of each update of a run; empty without a record. Raises ValueError if one
-    is not from 0 to 1.
-    """
+    """Returns the factor of each update of a run, if it has a record. ValueError if damaged."""
     factors, path = array("d"), Path(folder) / RECORD
     if path.exists():
         data = path.read_bytes()

@@ -48,12 +48,10 @@ MAX_SKIPPED = 20
 
 
 class Callbacks(list[Any]):
-    """Calls the methods that objects have, in the order of the objects.
+    """Calls the methods that objects have, in the order of the objects. Raises ValueError: an
+    object has none of `HOOKS`.
 
     All ranks call them, each on objects of its own, so that what they change stays the same on all.
-
-    Raises:
-        ValueError: an object has none of `HOOKS`.
     """
 
     def __init__(self, callbacks: list[object]):
@@ -64,9 +62,7 @@ class Callbacks(list[Any]):
                 raise ValueError(f"{type(one).__name__} is not a callback: it has none of {hooks}")
 
     def __call__(self, hook: str, *arguments: object) -> list[object]:
-        """Calls a hook. Returns what the methods do. Raises UserError naming a user's callback that
-        fails.
-        """
+        """Calls a hook. Returns the results. UserError naming a user's callback that fails."""
         results = []
         for one in self:
             method: Callable | None = getattr(one, hook, None)
@@ -93,9 +89,7 @@ class Callbacks(list[Any]):
 
 
 class Losses:
-    """Reports what the last update returned, means over the ranks. NaN, where no gradient step was
-    taken, is left out.
-    """
+    """Reports what the last update returned, means over the ranks, without NaN."""
 
     losses: Mapping[str, Any] = {}
 
@@ -136,16 +130,12 @@ class NonFiniteGuard:
         self.check(trainer.rollout)
 
     def may_save(self, trainer: Trainer) -> bool:
-        """Returns whether the last update was applied, or the policy is about to be replaced: the
-        last checkpoint precedes a NaN.
-        """
+        """Returns whether the last update was applied, or the policy is about to be replaced."""
         return self.tolerates_divergence or self.check(trainer.rollout)
 
     def check(self, rollout: RolloutLike) -> bool:
         """Returns True if the last update was applied, False if it was skipped. Synchronises.
-
-        Raises:
-            NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
+        Raises NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
         """
         if self.nonfinite_check is None:
             return True
@@ -180,9 +170,7 @@ class NonFiniteGuard:
 
 
 class Snapshots:
-    """Saves what the policy acts with at the end of each of `n` equal parts of the budget, for
-    `evaluate.py ratings=true`.
-    """
+    """Saves what the policy acts with at the end of each of `n` equal parts of the budget."""
 
     def __init__(self, saver: Saver, n: int):
         self.saver, self.n, self.n_parts_done = saver, n, 0
@@ -201,9 +189,7 @@ class Snapshots:
 
 
 class Progress:
-    """Shows a line about the run with each report: the fraction of the budget that is spent, None
-    without one, and a few words.
-    """
+    """Shows a line with each report: the fraction of the budget spent, if any, and words."""
 
     def __init__(self, show: Callable[[float | None, list[str]], None]):
         self.show = show

@@ -33,7 +33,8 @@ _SAVED = "n_episodes", "means", "squares", "scores", "cumulative"
 
 class SFL:
     """Sampling for learnability (Rutherford et al. 2024): the score of a home is the variance of
-    the outcomes of its episodes. A class of your own has the four methods below.
+    the outcomes of its episodes. A class of your own has the four methods below. Raises ValueError:
+    the environment has no two homes to draw, or no metric tells the outcome.
 
     Of a success with probability p that is the paper's learnability p (1 - p): 0 in homes that are
     always solved or never, most where half of the episodes succeed. The paper samples from the most
@@ -56,9 +57,6 @@ class SFL:
         means, squares: (D,) float32, running means of outcomes and of their squares, 0 before the
             first.
         scores: (D,) float32, of each home; the larger, the more often it is drawn.
-
-    Raises:
-        ValueError: the environment has no two homes to draw, or no metric tells the outcome.
     """
 
     @checked

@@ -265,12 +265,8 @@ def _add_report(window, report) -> list[float]:
 
 
 class Episodes:
-    """A callback that counts the episodes of a trainer, whose environment has been reset, and gives
-    the curriculum and the opponents their share. On a GPU it counts by a CUDA graph.
-
-    Attributes:
-        stats: the statistics.
-        opponents: those of the environment, or None.
+    """A callback that counts a trainer's episodes in `stats`, on a GPU by a CUDA graph, and gives
+    the curriculum and the environment's `opponents`, if any, their share.
     """
 
     def __init__(self, trainer: Trainer):
@@ -284,9 +280,8 @@ class Episodes:
     def begin(
         self, trainer: Trainer, sources: Sequence[str] | None = None, desync: bool = False
     ) -> None:
-        """Begins to count, before the first update, with statistics for the source of each layout.
-        `desync` starts the first episodes at random ages, if the environment can, and leaves them
-        out.
+        """Begins to count, by the source of each layout. `desync` starts the first episodes at
+        random ages, if the environment can, and leaves them out.
         """
         env, rollout = trainer.env, trainer.rollout
         allocate_layouts = getattr(trainer.collect, "allocate_layouts", None)
@@ -338,9 +333,7 @@ class Episodes:
         return {}
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
-        """Adds the statistics since the last report. Warns once of each metric that was infinite,
-        which NaN, for an episode without such a number, is not. Synchronises.
-        """
+        """Adds the statistics since the last report. Warns once of each infinite metric."""
         stats = self.stats.pop(trainer.ranks.sum)
         for name in self.stats.infinite:
             if name not in self.warned and trainer.ranks.rank == 0:

@@ -51,10 +51,7 @@ class Timing:
             self._add_finished()
 
     def pop(self) -> dict[str, float]:
-        """Returns the seconds of each phase since the last call. The current phase goes on.
-
-        Synchronises.
-        """
+        """Returns the seconds of each phase since the last call. Synchronises."""
         if self._starts:
             self.start(self._starts[-1][0])
         if self.device.type == "cuda":

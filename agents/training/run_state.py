@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
 
 class RunState:
-    """The state of a run: what trains, and the counters of the trainer, whose collector has reset
-    the environment.
-    """
+    """The state of a run: what trains, and the trainer's counters, after the first reset."""
 
     def __init__(self, trainer: Trainer):
         self.trainer = trainer
@@ -32,9 +30,7 @@ class RunState:
         self.has_named_unreachable = False
 
     def state_dict(self, has_episodes: bool = True) -> StateDict:
-        """Returns the state as dicts of tensors, most of them no copies, and plain values; with
-        episodes, that is the environment and the actor state.
-        """
+        """Returns the state, most of it no copies; with episodes, environment and actor."""
         trainer = self.trainer
         parts = dict(
             samples=trainer.samples,
@@ -54,9 +50,7 @@ class RunState:
         return parts | {k: part.state_dict() for k, part in others.items() if part is not None}
 
     def of_policy(self) -> StateDict:
-        """Returns what the policy acts with: its weights, and what wrappers of the environment have
-        learnt, if anything.
-        """
+        """Returns the policy's weights, and what wrappers of the environment have learnt."""
         wrappers = optional(self.env_state.env, "wrapper_state")()
         learnt = {"wrappers": wrappers} if wrappers else {}
         return dict(policy=self.trainer.policy.state_dict(), **learnt)

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 class Trainer:
     """Trains a policy in an environment until a budget is spent. With several ranks, each has a
-    trainer, and all do the same updates: rank 0's clock decides.
+    trainer, and all do the same updates: rank 0's clock decides. Raises ValueError: the budget
+    anneals the learning rate of a learner without `set_lr`.
 
     Args:
         env: the environment.
@@ -54,9 +55,6 @@ class Trainer:
         samples_at_report: samples at the last report that was due; a resumed run writes the later.
         curriculum: draws the homes of new episodes; None: the environment does.
         timing, tuning, episodes, nonfinite_guard: the callbacks that every training has.
-
-    Raises:
-        ValueError: the budget anneals the learning rate of a learner without `set_lr`.
     """
 
     def __init__(

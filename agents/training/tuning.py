@@ -32,9 +32,7 @@ class Tuning:
             )
 
     def follow(self, timetable: Sequence[tuple[int, Mapping[str, float]]]) -> None:
-        """Sets settings later on: (samples, settings as for `set`) each, in order. Raises
-        ValueError if one cannot change.
-        """
+        """Sets settings later on, (samples, settings) each, in order. ValueError as `set`."""
         for key in {key for _, values in timetable for key in values}:
             self._owner(key)
         self.timetable = [*timetable]

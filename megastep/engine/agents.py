@@ -17,7 +17,8 @@ MAX_RES = ENGINE.constants["MAX_RES"]  # rays per camera
 
 
 class Agents(SetOnce):
-    """The agents of N environments, A each, all with the same cameras.
+    """The agents of N environments, A each, all with the same cameras. Raises ValueError naming the
+    argument that is out of range.
 
     Args:
         n_envs: number of environments N.
@@ -34,9 +35,6 @@ class Agents(SetOnce):
         velocity: (N, A, 2) metres per second.
         angvelocity: (N, A) degrees per second.
         error_flag: (1,) int32, see :func:`check`.
-
-    Raises:
-        ValueError: naming the argument that is out of range.
     """
 
     _replaceable = ("positions", "angles", "velocity", "angvelocity")
@@ -99,21 +97,16 @@ _OF_OBJECTS = dict(
 
 def check(agents: Agents) -> None:
     """Raises the error that the device flagged since the last check, if any. Synchronises host and
-    device, so do not call it inside a step.
-
-    Raises:
-        EngineError: naming an environment with a non-finite position, angle or velocity, with an
-            action that is NaN, or with an action, layout or goal that does not exist; or naming
-            an object, and what is wrong with it.
+    device, so do not call it inside a step. Raises EngineError naming an environment with a
+    non-finite position, angle or velocity, with an action that is NaN, or with an action, layout or
+    goal that does not exist; or naming an object, and what is wrong with it.
     """
     checked = vars(checks.instance("agents", agents, Agents)).get("_checked")
     check_flag(agents.error_flag, checked and checked.key.objects)  # the last scenery's
 
 
 def check_flag(error_flag: torch.Tensor, objects: Objects | None = None) -> None:
-    """Does what :func:`check` does, for an environment without :class:`Agents`, whose flag,
-    (1,) int32, it clears.
-    """
+    """Does what :func:`check` does, for a flag, (1,) int32, which it clears."""
     flag = int(error_flag.item())
     if not flag:
         return

@@ -115,9 +115,7 @@ def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) 
 
 
 def ragged(name: str, value: Any, shape: Sequence, device: torch.device | None) -> RaggedTorch:
-    """Returns a Ragged with vals (*shape) as a RaggedTorch on ``device``. TypeError unless it is a
-    Ragged, ValueError unless its vals pass :func:`floats`.
-    """
+    """Returns a Ragged with vals (*shape), as :func:`floats`, on ``device``. TypeError if none."""
     if not hasattr(value, "torchify"):
         _refuse(name, "a Ragged", value, TypeError)
     value = value.torchify()
@@ -139,9 +137,7 @@ def length(name: str, value: object, axis: int = 0) -> int:
 def address(
     name: str, value: Any, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
 ) -> int:
-    """Returns a tensor's address. TypeError unless it is a tensor, ValueError unless it is
-    contiguous, on ``device``, of that shape and dtype.
-    """
+    """Returns the address of a contiguous tensor of that shape, dtype and device, or raises."""
     try:
         fits = (
             value.dtype is dtype
@@ -165,9 +161,7 @@ def optional(
 
 
 def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
-    """Returns ``value``. TypeError or ValueError unless it is a tensor of the shape and dtype of
-    ``like``, on its device.
-    """
+    """Returns a tensor of the shape and dtype of ``like``, on its device, or raises."""
     fits = isinstance(value, torch.Tensor) and value.shape == like.shape
     if not fits or value.dtype != like.dtype or value.device != like.device:
         wanted = f"a {like.dtype} tensor of shape {tuple(like.shape)} on {like.device}"

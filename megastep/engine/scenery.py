@@ -29,7 +29,8 @@ BOX_WALLS = ENGINE.constants["BOX_WALLS"]  # walls per bounding box
 class Layouts(SetOnce):
     """The static part of scenery: the floor plans that environments share. ``lines.vals``,
     ``textures.vals``, ``baked.vals``, ``lights.vals`` and ``agent_textures`` may be written in
-    place. Call :func:`~megastep.engine.bake` after moving walls or lights.
+    place. Call :func:`~megastep.engine.bake` after moving walls or lights. Raises TypeError,
+    ValueError naming the argument that does not fit.
 
     Args:
         lines: Ragged (W, 2, 2) metres, the walls of each layout.
@@ -41,9 +42,6 @@ class Layouts(SetOnce):
     Attributes:
         baked: Ragged (T,), the light on each texel.
         texels: (T, 4), the memory that ``textures`` and ``baked`` share.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
     """
 
     def __init__(
@@ -122,7 +120,8 @@ class Layouts(SetOnce):
 
 class Scenery(SetOnce):
     """The scenery of N environments with A agents each, which share layouts.
-    :func:`megastep.scene.scenery` makes it from geometries.
+    :func:`megastep.scene.scenery` makes it from geometries. TypeError or ValueError name the
+    argument that does not fit.
 
     Args:
         n_agents: agents per environment A.
@@ -136,9 +135,6 @@ class Scenery(SetOnce):
         agent_lines: (N, A M, 2, 2), written by every render.
         agent_light: (N, K), written by every render.
         objects: :class:`~megastep.engine.Objects`, or None; may be set once.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
     """
 
     objects: Objects | None = None

@@ -78,9 +78,7 @@ def node_at(root: object, path: str) -> Any:
 
 
 def rebind(parent: Any, step: str, leaf: Any) -> None:
-    """Replaces a node's child at a ``step`` of :func:`walk` by ``leaf``. TypeError or
-    AttributeError if the node does not allow it.
-    """
+    """Replaces a node's child at a ``step`` of :func:`walk`. TypeError or AttributeError."""
     if isinstance(parent, tuple):
         raise TypeError("a tensor inside a tuple was replaced")
     if step.startswith("["):

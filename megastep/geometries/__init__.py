@@ -28,7 +28,8 @@ SOURCES = {name: getattr(sources, name) for name in sources.__all__}
 def sample(
     name: str, n: int, split: str = "training", seed: int = 1, **options: object
 ) -> list[dotdict]:
-    """Returns n geometries from a source. Equal arguments give equal geometries.
+    """Returns n geometries from a source. Equal arguments give equal geometries. Raises ValueError
+    for an unknown name, split or option, or a value that the source cannot use.
 
     Args:
         name: of the source, one of `SOURCES`.
@@ -36,9 +37,6 @@ def sample(
         split: "training", "test" or "all".
         seed: of the order in which geometries are drawn.
         options: of the source; :mod:`~megastep.geometries.sources` has them.
-
-    Raises:
-        ValueError: for an unknown name, split or option, or a value that the source cannot use.
     """
     if name not in SOURCES:
         raise ValueError(f"Unknown geometry source {name!r}; {closest(name, SOURCES)}")

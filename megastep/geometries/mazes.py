@@ -27,9 +27,7 @@ LIT = 3_000  # mm; a light is at most this walk, or two cells, from any cell
 
 
 def passages(size: int, braid: float, generator: PortableGenerator) -> list[list[int]]:
-    """Returns the cells that each cell opens to. The fraction `braid` of the dead ends is opened,
-    each to a random neighbour.
-    """
+    """Returns the cells that each cell opens to, a fraction `braid` of dead ends opened."""
     neighbours = [
         [
             row * size + column

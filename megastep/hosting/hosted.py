@@ -112,7 +112,7 @@ class Hosted:
         return wrapper_state(self.envs[0])
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives all wrappers the statistics of others, to stay if `is_frozen`. Raises ValueError."""
+        """Gives all wrappers the statistics of others, to stay if `is_frozen`. ValueError."""
         self.frozen = state if is_frozen else None
         for env in self.envs:
             load_wrapper_state(env, state)

@@ -201,7 +201,8 @@ class FreePoints:
     """Draws random points in the rooms of environments' homes, such as goals or places for objects,
     where an agent is 5 cm clear of every wall. A point is drawn in the layout that the environment
     shows at the call, so call it after the spawner. The k-th draw is the same on the CPU, on a GPU
-    and in a CUDA graph; a call does not synchronise.
+    and in a CUDA graph; a call does not synchronise. Raises ValueError if a geometry has no point
+    where an agent fits, or there are fewer geometries than layouts.
 
     Args:
         geometries: those that the scenery was made from.
@@ -211,10 +212,6 @@ class FreePoints:
 
     Attributes:
         points: (D, n_points, 2) float32 metres, the points of each layout.
-
-    Raises:
-        ValueError: if a geometry has no point where an agent fits, or there are fewer geometries
-            than layouts.
     """
 
     def __init__(

@@ -161,6 +161,7 @@ def plot_images(
     yaws: ArrayLike | None = None,
 ) -> np.ndarray:
     """Draws images side by side, one row of panels per name. Returns the axes, (names, images).
+    Raises ValueError: an image has another shape.
 
     Args:
         images: name -> (..., C, H, W), as policies see them. One channel is shown in grey, 0 to 1.
@@ -170,9 +171,6 @@ def plot_images(
         aspect: height of a panel over its width; by default pixels are square.
         axes: one per image, row by row: strips of :func:`panels`, or matplotlib's axes.
         yaws: degrees, the camera of each row of pixels, to label it with.
-
-    Raises:
-        ValueError: an image has another shape.
     """
     stacks = {name: _stack(name, image, transpose) for name, image in images.items()}
     shape = len(stacks), max(map(len, stacks.values()))

@@ -24,7 +24,7 @@ class LoggerError(RuntimeError):
 
 
 class Loggers:
-    """All loggers of one run.
+    """All loggers of one run. Raises LoggerError: the files cannot be written. They are unchanged.
 
     A file of JSON lines that cannot be written is warned about once, and the next report tries
     again. Any other logger is dropped with a warning when it cannot be made or fails.
@@ -33,9 +33,6 @@ class Loggers:
         folder: the run folder.
         step: environment steps at which a resumed run starts. Later lines are removed.
         others: functions that make loggers beside the JSON lines, by the loggers' names.
-
-    Raises:
-        LoggerError: the files cannot be written. They are unchanged.
     """
 
     def __init__(
@@ -67,9 +64,7 @@ class Loggers:
         self.write(trainer.samples, metrics)
 
     def write(self, step: int, metrics: Mapping[str, float | str]) -> None:
-        """Writes one report after `step` environment steps. The seed determines all metrics but
-        those of `perf/`.
-        """
+        """Writes a report after `step` environment steps; the seed determines all but `perf/`."""
         values = {name: x for name, x in metrics.items() if name != "samples"}
         perf = {name: x for name, x in values.items() if name.startswith("perf/")}
         of_seed = {name: x for name, x in values.items() if name not in perf}
@@ -78,9 +73,7 @@ class Loggers:
         self._call_others("write", step, {**of_seed, **perf})
 
     def may_save(self, trainer: object) -> bool:
-        """Flushes the metrics to disk, which a checkpoint must not reach beyond. Returns whether
-        they are there.
-        """
+        """Flushes the metrics to disk, before a checkpoint. Returns whether they are there."""
         return self.metrics.sync()
 
     def finish(self, step: int, result: RunResult) -> None:

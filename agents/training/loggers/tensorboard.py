@@ -78,9 +78,7 @@ class TensorBoard:
 
 
 def hparams(settings: dict, numbers: dict) -> tuple:
-    """Returns the summaries of settings and final numbers, in which true and false stay what they
-    are: PyTorch writes them as numbers.
-    """
+    """Returns the summaries of settings and final numbers, in which bools stay bools."""
     from torch.utils.tensorboard import summary
 
     kinds = importlib.import_module(f"{PLUGIN}.api_pb2")

@@ -17,7 +17,8 @@ TIMEOUT = 20
 
 
 class Wandb:
-    """Logs to Weights & Biases, online or offline. Never asks for a key on the terminal.
+    """Logs to Weights & Biases, online or offline. Never asks for a key on the terminal. Raises
+    RuntimeError: wandb is not installed, has no key, or did not start.
 
     The run's id is stored in its folder, so a resumed run continues the same Weights & Biases run.
     Its configuration has the settings and the commit of megastep, its summary the final numbers.
@@ -29,9 +30,6 @@ class Wandb:
         project: project on Weights & Biases.
         mode: `offline` needs no key and keeps the run in its folder until `wandb sync`.
         group: group of the run; a sweep sets it to the name of its folder, unless one is given.
-
-    Raises:
-        RuntimeError: wandb is not installed, has no key, or did not start.
     """
 
     def __init__(

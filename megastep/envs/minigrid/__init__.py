@@ -193,14 +193,12 @@ def custom(
     layouts: Callable[[int], tuple[torch.Tensor, torch.Tensor]], seed: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns what a function draws: D grids, of which each episode gets a random one, (D, H, W)
-    uint8, and the agents' starts in them, (D, 3) int32: x, y and direction.
+    uint8, and the agents' starts in them, (D, 3) int32: x, y and direction. Raises ValueError: they
+    have other shapes, unknown kinds, or a start that is no empty cell.
 
     Args:
         layouts: called with a seed. A cell is a kind, such as ``tasks.LIBRARY.constants["WALL"]``,
             plus 16 times a colour.
-
-    Raises:
-        ValueError: they have other shapes, unknown kinds, or a start that is no empty cell.
     """
     cells, starts = (torch.as_tensor(part) for part in layouts(seed))
     cells, starts = cells.to("cpu", torch.uint8), starts.to("cpu", torch.int32)
