@@ -81,6 +81,7 @@ def object_params(scenery: Scenery) -> bytes:
             objects=o.records,
             n_lines=len(o.line_object),
             lit=int(o.lit),
+            elevated=o.elevated,
         )
         packed = vars(o)["_packed"] = _Cached(key, struct)
     return packed.value

@@ -25,11 +25,13 @@ SHAPES = {
     "disc": _sides((1, 0), (0.5, _HALF), (-0.5, _HALF), (-1, 0), (-0.5, -_HALF), (0.5, -_HALF)),
     "crate": _sides((-1, -1), (1, -1), (1, 1), (-1, 1)),
     "door": [(-1, 0, 1, 0)],
+    "ramp": _sides((-1, -1), (1, -1), (1, 1), (-1, 1))[:3],
 }
 NUMBERS = {name: ENGINE.constants[name.upper()] for name in SHAPES}
 _BYTES, _BODY_BYTES = ENGINE.constants["OBJECT_BYTES"], ENGINE.constants["BODY_BYTES"]
 MAX_BODIES = ENGINE.constants["MAX_BODIES"]  # per environment
 FORCE, GRIP = 20.0, 40.0  # newtons
+RAMP_STEPS = 20
 MAX_FORCE = 1e6  # newtons
 MAX_MASS = 1e6  # kg
 MAX_OBJECTS_IN_ALL = (2**31 - 1) // ENGINE.constants["ERROR_KINDS"]
@@ -48,17 +50,23 @@ class Objects(SetOnce):
 
     Args:
         n_envs: number of environments N.
-        shapes: "disc", "crate" or "door" of each object. A disc is drawn as a hexagon, a crate is a
-            square, and a door is a segment along its angle.
+        shapes: "disc", "crate", "door" or "ramp" of each object. A disc is drawn as a hexagon, a
+            crate is a square, and a door is a segment along its angle. A ramp is a crate without
+            its side at -x, which is low: an agent drives over that one, and is elevated at +x.
         palette: (P, 3), linear light in [0, 1], the colours.
         lit: the lights of the layout fall on objects, by one sample each. By default all have full
             light, so that a colour looks the same everywhere.
         names: of the objects, for error messages.
         device: where to put them.
-        widths: of each crate, as a fraction of its length, above 0 and at most 1. Default: squares.
-        movable: of each object, if it is a body. Doors cannot be. Default: none are.
+        widths: of crates and ramps, as a fraction of their length, above 0 and at most 1.
+            Default: squares.
+        movable: of each object, if it is a body. Doors cannot be, ramps must be. Default: none are.
         force: newtons, at most, by which an agent of 1 kg pushes.
         grip: newtons, at most, between an agent and what it holds.
+        n_agents: agents per environment A. Needed with ramps.
+        ramp_steps: steps for which an agent is elevated after it has driven up a ramp, and longer
+            until it is over no body. It passes bodies then, but neither walls nor agents.
+        grab_elevated: elevated agents may hold bodies.
 
     Attributes:
         records: (N, O, 8) float32, the memory that the tensors below, to ``carriers``, share.
@@ -84,6 +92,8 @@ class Objects(SetOnce):
         movable: (N, B) bool, at first True. Else it is as if its mass were infinite.
         locked: (N, B) bool. True: likewise.
         grabbed: (N, B) bool, held since the last step.
+        elevated: (N, A) int32, if there are ramps, else None. Above 0: steps for which the agent is
+            elevated, at least. Below 0: -1 - the index of the ramp that it is driving up.
 
     Raises:
         ValueError: naming the argument that does not fit.
@@ -101,6 +111,9 @@ class Objects(SetOnce):
         movable: Sequence[bool] | None = None,
         force: float = FORCE,
         grip: float = GRIP,
+        n_agents: int = 0,
+        ramp_steps: int = RAMP_STEPS,
+        grab_elevated: bool = False,
     ):
         device = checks.device("device", device)
         n = checks.integer("n_envs", n_envs, 1)
@@ -120,6 +133,9 @@ class Objects(SetOnce):
             raise ValueError("widths and movable must have one entry per object")
         if any(map(lambda shape, moves: moves and shape == "door", shapes, movable)):
             raise ValueError("movable must be False for doors: only discs and crates can be pushed")
+        ramps = [moves for shape, moves in zip(shapes, movable) if shape == "ramp"]
+        if not all(ramps):
+            raise ValueError("movable must be True for ramps")
         bodies = [k for k, moves in enumerate(movable) if moves]
         if len(bodies) > MAX_BODIES:
             raise ValueError(
@@ -128,6 +144,8 @@ class Objects(SetOnce):
             )
         self.force = checks.number("force", force, 0, MAX_FORCE, "newtons")
         self.grip = checks.number("grip", grip, 0, MAX_FORCE, "newtons")
+        self.ramp_steps = checks.integer("ramp_steps", ramp_steps, 1, 2**31 - 1)
+        self.grab_elevated = int(checks.flag("grab_elevated", grab_elevated))
 
         self.records = torch.zeros((n, len(shapes), _BYTES // 4), device=device)
         self.sizes.fill_(0.1)
@@ -138,7 +156,7 @@ class Objects(SetOnce):
         objects = torch.arange(len(shapes), dtype=torch.int32)
         self.line_object = objects.repeat_interleave(n_lines).to(device)
         ends = [
-            (ax, ay * width, bx, by * width) if shape == "crate" else (ax, ay, bx, by)
+            (ax, ay * width, bx, by * width) if shape in ("crate", "ramp") else (ax, ay, bx, by)
             for shape, width in zip(shapes, widths)
             for ax, ay, bx, by in SHAPES[shape]
         ]
@@ -158,6 +176,8 @@ class Objects(SetOnce):
         self.holders.fill_(-1)
         self.owners.fill_(-1)
         self.movable.fill_(True)
+        agents = (n, checks.integer("n_agents", n_agents, 1)) if ramps else None
+        self.elevated = agents and torch.zeros(agents, dtype=torch.int32, device=device)
 
     # views of records: four floats, two integers, three flags
     positions = property(lambda self: self.records[..., :2])

@@ -128,7 +128,8 @@ def physics(
                 f"there are {a} and {scenery.objects.n_bodies}"
             )
         kernel, shape = "physics_bodies", WARP * n
-        of_bodies = dict(force=scenery.objects.force, grip=scenery.objects.grip)
+        names = "force", "grip", "ramp_steps", "grab_elevated"
+        of_bodies = {name: getattr(scenery.objects, name) for name in names}
     launch(
         *(ENGINE, kernel, device, shape),
         **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),

@@ -37,8 +37,10 @@ struct PhysicsParams : WorldParams {
 };
 
 struct PhysicsBodiesParams : PhysicsParams {
-    float force;  // newtons, at most, of each agent
-    float grip;   // newtons, at most, between an agent and what it holds
+    float force;        // newtons, at most, of each agent
+    float grip;         // newtons, at most, between an agent and what it holds
+    int ramp_steps;     // for which an agent is elevated that has driven up a ramp
+    int grab_elevated;  // 0: elevated agents hold nothing
 };
 
 struct UpdateAgentGeometryParams : WorldParams {

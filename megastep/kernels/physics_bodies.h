@@ -26,7 +26,8 @@ constexpr float MAX_STRETCH = 0.25f;  // metres that an agent and what it holds 
 constexpr float MIN_LIMIT = 0.2f;     // m/s that any slot may have beyond the fastest at the start
 constexpr float AGENT_MASS = 1.f;     // kg
 constexpr float GRAVITY = 9.81f;      // m/s2
-constexpr float ARM = 0.93f;  // of friction with the floor, per radius of gyration: within 7 %
+constexpr float EDGE = 0.05f;  // metres before a ramp's high side at which an agent is over it
+constexpr float ARM = 0.93f;   // of friction with the floor, per radius of gyration: within 7 %
 constexpr float RADIANS = 0.017453292519943295f;
 constexpr float DEGREES = 57.29577951308232f;
 
@@ -56,6 +57,7 @@ struct Bodies {
     float extent[MAX_SLOTS], speeds[MAX_SLOTS];
     int exists[MAX_SLOTS], holders[MAX_SLOTS], hit[MAX_SLOTS];
     int awake[MAX_SLOTS], overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
+    int elevated[MAX_SLOTS];  // of agents, as in ObjectsParams
     int candidates[MAX_CANDIDATES];
     int touch_a[MAX_TOUCHES], touch_b[MAX_TOUCHES], levels[MAX_TOUCHES];
     Touch touches[MAX_TOUCHES];
@@ -128,7 +130,7 @@ HD void begin_body(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
 }
 
 // Stores where a body is in its holder's frame if it was just grabbed. Else has the holder let go
-// if one of the two was put elsewhere.
+// if one of the two was put elsewhere, or if it is elevated and may not grab.
 HD void begin_hold(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
     int slot = p.scenery.n_agents + k, a = b.holders[slot];
     if (a < 0)
@@ -144,7 +146,8 @@ HD void begin_hold(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
         body.hold_turn = b.hold_turn[k] = b.angles[slot] - b.angles[a];
     }
     float off_x = x - b.hold_x[k], off_y = y - b.hold_y[k];
-    if (off_x * off_x + off_y * off_y > MAX_STRETCH * MAX_STRETCH)
+    int is_up = b.elevated[a] > 0 && !p.grab_elevated;
+    if (is_up || off_x * off_x + off_y * off_y > MAX_STRETCH * MAX_STRETCH)
         b.holders[slot] = -1;
 }
 
@@ -165,6 +168,48 @@ HD float top_speed(const Bodies& b, int i, int n_agents) {
         return now;
     float arm = speed_of(b.hold_x[i - n_agents], b.hold_y[i - n_agents], 1.f, b.extent[i]);
     return maxf(now, speed_of(b.velocity.x[a], b.velocity.y[a], b.velocity.turn[a], arm));
+}
+
+// Returns 1 if agent a, before the low side of the ramp in a slot and within reach of it, drives
+// ahead in its direction: from the low side at -hx to the high one.
+HD int drives_up(const Bodies& b, int a, int slot, float reach) {
+    const Hull &agent = b.hulls[a], &ramp = b.hulls[slot];
+    float dx = agent.x - ramp.x, dy = agent.y - ramp.y;
+    float x = ramp.cosine * dx + ramp.sine * dy + ramp.hx, y = ramp.cosine * dy - ramp.sine * dx;
+    return x < 0.f && x > -reach && ABS(y) <= ramp.hy &&
+           ramp.cosine * b.wish_x[a] + ramp.sine * b.wish_y[a] > 0.f;
+}
+
+// Returns 1 if agent a is over the high side of the ramp in a slot.
+HD int is_over(const Bodies& b, int a, int slot) {
+    const Hull &agent = b.hulls[a], &ramp = b.hulls[slot];
+    float x = ramp.cosine * (agent.x - ramp.x) + ramp.sine * (agent.y - ramp.y);
+    return x + agent.hx + EDGE >= ramp.hx;
+}
+
+// Returns what agent a passes in this step, as `elevated` in ObjectsParams. It stays on a ramp, and
+// after the last of its steps on other bodies, until it overlaps none.
+HD int elevation_of(const PhysicsBodiesParams& p, const Bodies& b, int env, int a) {
+    const ObjectsParams& o = p.objects;
+    int n_agents = p.scenery.n_agents, up = o.elevated[env * n_agents + a], stays = 0;
+    for (int k = 0; k < o.n_bodies && up <= 1 && !stays; k++)
+        stays = (up == 1 || up == -1 - k) && b.exists[n_agents + k] &&
+                gap_of(touch(b.hulls[a], b.hulls[n_agents + k])) < 0.f;
+    if (up > 1)
+        up--;
+    else if (!stays)
+        up = 0;
+    float reach = b.extent[a] + top_speed(b, a, n_agents) * p.seconds;
+    for (int k = 0; k < o.n_bodies && up == 0; k++)
+        if (o.shapes[o.body_objects[k]] == RAMP && b.exists[n_agents + k] &&
+            drives_up(b, a, n_agents + k, reach))
+            up = -1 - k;
+    return up < 0 && is_over(b, a, n_agents - 1 - up) ? p.ramp_steps : up;
+}
+
+// Returns 1 if an agent that is `elevated` passes a slot.
+HD int passes_slot(int elevated, int slot, int n_agents) {
+    return slot >= n_agents && (elevated > 0 || elevated == n_agents - 1 - slot);
 }
 
 // Appends to a list what those threads of a group have that have something, in the order of their
@@ -240,11 +285,12 @@ HD int find_candidates(const PhysicsBodiesParams& p, const Group& group, Bodies&
             continue;
         const Hull& hull = b.hulls[a];
         float apart = b.extent[a] + reach;
+        int elevated = b.elevated[a];
         for (int start = a + 1; start < n_slots; start += Group::SIZE) {
             int c = start + group.rank, has = c < n_slots;
             if (has)
                 has = b.exists[c] && (b.inv_mass[a] > 0.f || b.inv_mass[c] > 0.f) &&
-                      may_touch(b, a, c, reach);
+                      may_touch(b, a, c, reach) && !passes_slot(elevated, c, s.n_agents);
             add_candidate(group, b, has, a, SLOT, c, n);
         }
         if (b.inv_mass[a] == 0.f)
@@ -669,10 +715,16 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
             begin_agent(p, b, env, i);
         else
             begin_body(p, b, env, i - n_agents);
-        b.hit[i] = b.overlaps[i] = 0;
+        b.hit[i] = b.overlaps[i] = b.elevated[i] = 0;
         b.before[i] = b.hulls[i];
     }
     sync(group);
+    if (p.objects.elevated) {
+        int* elevated = p.objects.elevated + env * n_agents;
+        for (int a = group.rank; a < n_agents; a += Group::SIZE)
+            elevated[a] = b.elevated[a] = elevation_of(p, b, env, a);
+        sync(group);
+    }
     for (int k = group.rank; k < n_slots - n_agents; k += Group::SIZE)
         begin_hold(p, b, env, k);
     sync(group);

@@ -121,8 +121,11 @@ HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
             point = hidden_point<with_objects>(p, group, env, a, layout, point);
         sync(group);  // all threads have read what is written now
         if (group.rank == 0) {
-            if (with_objects)
+            if (with_objects) {
                 drop_all(p.objects, env, a);
+                if (p.objects.elevated)
+                    p.objects.elevated[i] = 0;
+            }
             if (p.point_index)
                 p.point_index[i] = a * n_per_agent + point;
             place(p, i, p.points + 2 * ((long long)layout * p.n_points + a * n_per_agent + point),

@@ -19,7 +19,7 @@ from megastep.modules.movement import (
     to_lanes,
     to_local,
 )
-from megastep.modules.objects import COLOURS, Crate, Disc, Door, Objects, doorways
+from megastep.modules.objects import COLOURS, Crate, Disc, Door, Objects, Ramp, doorways
 from megastep.modules.robots import DifferentialMovement, Lidar, Robot
 from megastep.modules.sensors import IMU, RGB, Depth, downsample, render
 from megastep.modules.spawning import FreePoints, RandomSpawns, spawn_points
@@ -29,4 +29,5 @@ __all__ = ["COLOURS", "ENDLESS", "IMU", "MOVES", "RGB", "TEXELS_PER_POINT", "TUR
 __all__ += ["Depth", "Disc", "Door", "FreePoints", "Lifecycle", "MomentumMovement", "Objects"]
 __all__ += ["RandomLifespans", "RandomSpawns", "CounterGenerator", "SimpleMovement", "doorways"]
 __all__ += ["downsample", "random_ages", "render", "spawn_points", "to_agents", "to_global"]
-__all__ += ["to_lanes", "to_local", "visible_texels", "DifferentialMovement", "Lidar", "Robot"]
+__all__ += ["to_lanes", "to_local", "visible_texels", "DifferentialMovement", "Lidar", "Ramp"]
+__all__ += ["Robot"]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 #: The tensors of a kind.
 TENSORS = "positions", "angles", "sizes", "colours", "visible", "solid", "open", "carriers"
 REACH = 0.05  # metres between surfaces at which an agent touches an object
-_DISC, _CRATE = NUMBERS["disc"], NUMBERS["crate"]
+_DISC, _DOOR = NUMBERS["disc"], NUMBERS["door"]
 _INTO_WALL = 0.001  # metres that a door is longer than its opening, on either side
 
 
@@ -83,9 +83,10 @@ class Kind:
         ahead = (cosine * offset[..., 0] + sine * offset[..., 1]).abs()
         aside = (cosine * offset[..., 1] - sine * offset[..., 0]).abs()
         shapes, sizes = objects.shapes[self.slots], self.sizes[:, None]
-        is_disc, is_crate = shapes == _DISC, shapes == _CRATE
+        is_disc = shapes == _DISC
+        has_width = ~is_disc & (shapes != _DOOR)
         ahead = (ahead - sizes * ~is_disc).clamp(min=0)
-        aside = (aside - sizes * objects.widths[self.slots] * is_crate).clamp(min=0)
+        aside = (aside - sizes * objects.widths[self.slots] * has_width).clamp(min=0)
         limit = agents.radius + reach + sizes * is_disc
         return (ahead.square() + aside.square() <= limit.square()) & self._loose()[:, None]
 

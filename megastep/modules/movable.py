@@ -46,12 +46,15 @@ class Movable(Kind):
     def grab(self, mask: torch.Tensor) -> None:
         """Has agents grab objects, where they are, where ``mask``, (N, A, K) bool, is True. If
         several want one, the first has it. Nobody grabs what is not there, carried, held, or
-        locked.
+        locked. Elevated agents grab nothing, unless they may.
         """
+        objects = self._objects.all
+        if objects.elevated is not None and not objects.grab_elevated:
+            mask = mask & (objects.elevated <= 0)[..., None]
         free = self._loose() & ~self.locked & (self.holders < 0)
         taken = mask.any(1) & free
         self.holders.copy_(torch.where(taken, mask.int().argmax(1).int(), self.holders))
-        self._objects.all.grabbed[:, self._bodies].logical_or_(taken)
+        objects.grabbed[:, self._bodies].logical_or_(taken)
 
     def held(self) -> torch.Tensor:
         """Returns (N, A, K) bool: which agents hold which objects."""

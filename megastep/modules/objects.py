@@ -14,7 +14,7 @@ from megastep import engine
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
-from megastep.engine.objects import FORCE, GRIP, MAX_MASS, MAX_OBJECTS
+from megastep.engine.objects import FORCE, GRIP, MAX_MASS, MAX_OBJECTS, RAMP_STEPS
 from megastep.modules.kinds import Doors, Kind
 from megastep.modules.lifecycle import derived_seed
 from megastep.modules.movable import Movable
@@ -60,6 +60,18 @@ class Crate(NamedTuple):
     width: float | None = None  # metres, up to the side; default: squares
 
 
+class Ramp(NamedTuple):
+    """A kind of ramps: movable rectangles that agents drive up from their low side, which is not
+    drawn. It is the side at -x, at one end of the ramp's length.
+    """
+
+    count: int  # per environment
+    side: float = 0.6  # metres, the length
+    width: float = 0.4  # metres, up to the length
+    mass: float = 1.0  # kg
+    friction: float = 0.5  # coefficient with the floor
+
+
 class Door(NamedTuple):
     """A kind of solid objects that close the doorways of homes, one each."""
 
@@ -83,16 +95,22 @@ class Objects:
     Args:
         geometries: those that the scenery was made from.
         core: the environment's core, whose ``scenery.objects`` they become. It can have only one.
-        kinds: {name: :class:`Disc`, :class:`Crate`, :class:`Door`, or a number of discs}.
+        kinds: {name: :class:`Disc`, :class:`Crate`, :class:`Ramp`, :class:`Door`, or a number of
+            discs}.
         colours: names or hexadecimal sRGB of the colours. Default: ``COLOURS``.
         lit: see :class:`megastep.engine.Objects`.
         n_points: points per layout at which objects are placed.
         seed: of the points and draws. Default: the core's.
         force: newtons, at most, by which an agent, of 1 kg, pushes.
         grip: newtons, at most, between an agent and what it holds.
+        ramp_steps: steps for which an agent is elevated after it has driven up a ramp, and longer
+            until it is over no movable object. It passes these then, but neither walls, nor other
+            solid objects, nor agents.
+        grab_elevated: elevated agents may grab and hold objects, and so ride on them.
 
     Attributes:
-        all: the :class:`megastep.engine.Objects` of all kinds.
+        all: the :class:`megastep.engine.Objects` of all kinds. Its ``elevated``, (N, A) int32, is
+            above 0 for elevated agents, if there are ramps.
         points: (D, n_points, 2) float32 metres, where the largest disc or crate is 5 cm clear of
             every wall.
 
@@ -104,13 +122,15 @@ class Objects:
         self,
         geometries: Sequence[dotdict],
         core: Core,
-        kinds: Mapping[str, int | Disc | Crate | Door],
+        kinds: Mapping[str, int | Disc | Crate | Ramp | Door],
         colours: Sequence[str] = tuple(COLOURS),
         lit: bool = False,
         n_points: int = 128,
         seed: int | None = None,
         force: float = FORCE,
         grip: float = GRIP,
+        ramp_steps: int = RAMP_STEPS,
+        grab_elevated: bool = False,
     ):
         if core.scenery.objects is not None:
             raise ValueError("core has objects: give all kinds to one Objects")
@@ -126,11 +146,12 @@ class Objects:
             size, width = 0.0, 1.0  # of doors, whose openings say it
             if isinstance(kind, Disc):
                 size = checks.number(f"radius of {name}", kind.radius, 0, 100)
-            elif isinstance(kind, Crate):
+            elif isinstance(kind, (Crate, Ramp)):
                 size = checks.number(f"side of {name}", kind.side, 0, 100) / 2
                 if kind.width is not None and kind.width != kind.side:
                     width = checks.number(f"width of {name}", kind.width, 0, kind.side) / kind.side
-            moves = checks.flag(f"movable of {name}", getattr(kind, "movable", False))
+            is_ramp = isinstance(kind, Ramp)
+            moves = checks.flag(f"movable of {name}", getattr(kind, "movable", is_ramp))
             if moves and not isinstance(kind, Door):
                 checks.number(f"mass of {name}", kind.mass, 0, MAX_MASS, "kg")
                 if kind.friction != 0:
@@ -143,7 +164,8 @@ class Objects:
             movable += [moves] * count
             names += [f"{name} {k}" for k in range(count)]
         of_all = core.n_envs, shapes, _palette(colours), lit, names, core.device
-        self.all = engine.Objects(*of_all, widths, movable, force, grip)
+        up = core.n_agents, ramp_steps, grab_elevated
+        self.all = engine.Objects(*of_all, widths, movable, force, grip, *up)
         self.all.sizes.copy_(torch.tensor(sizes))
         self.all.solid.copy_(torch.tensor(solid))
         core.scenery.objects = self.all
@@ -152,7 +174,7 @@ class Objects:
         self.seed = derived_seed(seed, "objects")
         n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
         loose = [
-            size * math.hypot(1, width) if shape == "crate" else size
+            size * math.hypot(1, width) if shape in ("crate", "ramp") else size
             for shape, size, width in zip(shapes, sizes, widths)
         ]
         radius = max(core.agents.radius, *loose)
@@ -164,7 +186,7 @@ class Objects:
         for name, kind in kinds.items():
             if isinstance(kind, Door):
                 self.kinds[name] = Doors(self, name, slots[name], openings)
-            elif isinstance(kind, (Disc, Crate)) and kind.movable:
+            elif isinstance(kind, Ramp) or isinstance(kind, (Disc, Crate)) and kind.movable:
                 self.kinds[name] = Movable(self, name, slots[name])
                 self.kinds[name].masses.fill_(kind.mass)
                 self.kinds[name].frictions.fill_(kind.friction)
@@ -176,8 +198,8 @@ class Objects:
 
 
 def _count(name, kind, openings) -> int:
-    if not isinstance(kind, (Disc, Crate, Door)):
-        raise ValueError(f"{name} must be a number, Disc, Crate or Door, but is {kind!r}")
+    if not isinstance(kind, (Disc, Crate, Ramp, Door)):
+        raise ValueError(f"{name} must be a number, Disc, Crate, Ramp or Door, but is {kind!r}")
     if not isinstance(kind, Door):
         return checks.integer(f"the number of {name}", kind.count, 1, MAX_OBJECTS)
     most = int(openings.widths.max())

@@ -132,8 +132,8 @@ def plot_object(
     colour: ArrayLike,
     width: float = 1.0,
 ) -> None:
-    """Draws a disc, a crate or a door, as :class:`megastep.engine.Objects` has them; the colour
-    is (3,), sRGB. A crate's width is a fraction of its length.
+    """Draws a disc, a crate, a ramp or a door, as :class:`megastep.engine.Objects` has them; the
+    colour is (3,), sRGB. The width of a crate or ramp is a fraction of its length.
     """
     area, position = Area.on(ax), np.asarray(position, float)
     fill, edge = tuple(np.asarray(colour, float)), area.style.colours.text
@@ -145,6 +145,11 @@ def plot_object(
         aside = width * aside
         corners = [ahead + aside, aside - ahead, -ahead - aside, ahead - aside]
         area.polygon(position + np.array(corners), OBJECTS, fill=fill, edge=edge, width=0.7)
+    elif shape == "ramp":
+        aside = width * aside
+        corners = position + np.array([aside - ahead, ahead + aside, ahead - aside, -ahead - aside])
+        area.polygon(corners, OBJECTS, fill=fill, alpha=0.5)
+        area.line(corners, OBJECTS, colour=edge, width=1.4)
     else:
         area.line([position - ahead, position + ahead], OBJECTS, colour=edge, width=4.6)
         area.line([position - ahead, position + ahead], OBJECTS, colour=fill, width=3.2)

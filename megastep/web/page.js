@@ -121,7 +121,7 @@ function sight({ simulation, lane }) {
   })];
 }
 
-// Draws discs, crates and doors: records of 32 bytes, as megastep/kernels/common/objects.h has them.
+// Draws discs, crates, ramps and doors: records of 32 bytes, as megastep/kernels/common/objects.h has them.
 function drawObjects(simulation, plan, context) {
   const n = simulation.word("objects.n_objects") ?? 0, field = (...at) => simulation.field(...at);
   for (let i = 0; i < n; i++) {
@@ -130,11 +130,13 @@ function drawObjects(simulation, plan, context) {
     const hue = 3 * field("objects.objects", 8 * n, Int32Array)[8 * i + 5];
     const kind = field("objects.shapes", n, Int32Array)[i], angle = degrees * Math.PI / 180;
     const fill = colour(field("objects.palette", hue + 3).subarray(hue)), look = [fill, css("--text"), 1];
-    const corner = (a, b) => plan.at([x + size * (a * Math.cos(angle) - b * Math.sin(angle)),
-      y + size * (a * Math.sin(angle) + b * Math.cos(angle))]);
+    const line = field("objects.line_starts", n, Int32Array)[i], width = -field("objects.ends", 4 * line + 2)[4 * line + 1];
+    const corner = (a, b) => plan.at([x + size * (a * Math.cos(angle) - b * width * Math.sin(angle)),
+      y + size * (a * Math.sin(angle) + b * width * Math.cos(angle))]);
     if (!visible || isOpen) continue;
     if (kind === 0) disc(context, plan.at([x, y]), Math.max(size * plan.scale, 3), ...look);
     else if (kind === 1) shape(context, [corner(1, 1), corner(-1, 1), corner(-1, -1), corner(1, -1), corner(1, 1)], ...look);
+    else if (kind === 3) shape(context, [corner(-1, 1), corner(1, 1), corner(1, -1), corner(-1, -1)], ...look);
     else shape(context, [corner(-1, 0), corner(1, 0)], null, fill, 4);
   }
 }

@@ -55,7 +55,7 @@ def same_bits(ours, theirs):
         torch.testing.assert_close(*bits, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("source", ["box", "homes"])
+@pytest.mark.parametrize("source", ["box", "homes", "ramps"])
 def test_cuda_kernels_on_a_cpu_agree_on_every_bit(source, cuda_on_cpu, monkeypatch):
     expected = trajectory("cpu", source)
     cuda_on_cpu.install(monkeypatch)
@@ -67,7 +67,7 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(source, cuda_on_cpu, monkeypat
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("source", ["box", "homes"])
+@pytest.mark.parametrize("source", ["box", "homes", "ramps"])
 def test_cpu_and_gpu_agree_on_every_bit(source):
     same_bits(trajectory("cpu", source, 60), trajectory("cuda", source, 60))
 
@@ -76,6 +76,7 @@ def test_cpu_and_gpu_agree_on_every_bit(source):
     "source, n_envs, n_steps",
     [
         ("box", 16, 60),
+        ("ramps", 16, 60),
         pytest.param("homes", 32, 60, marks=pytest.mark.slow),
         pytest.param("box", 1000, 700, marks=pytest.mark.nightly),
         pytest.param("homes", 500, 600, marks=pytest.mark.nightly),
@@ -262,6 +263,7 @@ def slots_of(scenery, agents, e, wish):
                 w=np.radians(float(wish[1][e, a])),
                 wish=wish[0][e, a].double().numpy(),
                 **dict(m=1.0, i=0.0, limit=20.0, is_agent=True),
+                elevated=0 if o.elevated is None else int(o.elevated[e, a]),
             )
         )
     for k in range(o.n_objects):
@@ -272,6 +274,8 @@ def slots_of(scenery, agents, e, wish):
             s["radius"], gyration2 = size, size**2 / 2
         else:
             s["half"] = np.array([size, size * width])
+        if int(o.shapes[k]) == 3:
+            s["steps"] = o.ramp_steps
         if k >= o.n_bodies:
             fixed.append(s)
             continue
@@ -295,11 +299,19 @@ def slots_of(scenery, agents, e, wish):
     return slots, [*walls, *fixed]
 
 
-@pytest.mark.parametrize("n_envs, n_steps", [(4, 12), pytest.param(10, 24, marks=pytest.mark.slow)])
-def test_a_step_is_the_twins(n_envs, n_steps):
+@pytest.mark.parametrize(
+    "source, n_envs, n_steps",
+    [
+        ("box", 4, 12),
+        ("ramps", 4, 24),
+        pytest.param("box", 10, 24, marks=pytest.mark.slow),
+        pytest.param("ramps", 16, 60, marks=pytest.mark.slow),
+    ],
+)
+def test_a_step_is_the_twins(source, n_envs, n_steps):
     """From states that come up in play. Rounding may decide which of two sides touches."""
-    off, moved = [], 0
-    scenery, agents, random = bodies.world(n_envs, "box", seed=7)
+    off, moved, ups = [], 0, {0: 0, -1: 0, 1: 0}
+    scenery, agents, random = bodies.world(n_envs, source, seed=7)
     o = scenery.objects
 
     def twin(actions):
@@ -313,7 +325,8 @@ def test_a_step_is_the_twins(n_envs, n_steps):
         for e in range(n_envs):
             slots, fixed = slots_of(scenery, agents, e, wish)
             bodies_twin.step(slots, fixed, 0.1)
-            ends.append([np.array([*s["at"], s["angle"], *s["v"]]) for s in slots])
+            up = [s.get("elevated", 0) for s in slots]
+            ends.append([np.array([*s["at"], s["angle"], *s["v"], u]) for s, u in zip(slots, up)])
         return torch.as_tensor(np.array(ends))
 
     odds = torch.tensor([1.0, 1, 1, 8, 1, 2, 2, 3, 3]).expand(n_envs, -1)
@@ -327,13 +340,18 @@ def test_a_step_is_the_twins(n_envs, n_steps):
         angles = torch.cat([agents.angles, o.angles[:, : o.n_bodies]], 1).double()
         turned = (angles - expected[..., 2] + 180) % 360 - 180
         gap = torch.cat(
-            [at - expected[..., :2], 0.01 * turned[..., None], 0.1 * (v - expected[..., 3:])], -1
+            [at - expected[..., :2], 0.01 * turned[..., None], 0.1 * (v - expected[..., 3:5])], -1
         )
         off.append(gap.abs().amax((1, 2)))
+        if o.elevated is not None:
+            assert torch.equal(o.elevated, expected[:, :3, 5].int())
+            for up in o.elevated.sign().flatten().tolist():
+                ups[up] += 1
         moved += int((o.velocity != 0).any((1, 2)).sum())
     off = torch.stack(off)
     assert moved > n_envs * n_steps / 10
     assert (off < 1e-4).double().mean() > 0.99
+    assert source != "ramps" or min(ups.values()) > 5
 
 
 @pytest.mark.cuda

@@ -18,11 +18,17 @@ MOVES = torch.tensor([(0, 0, 0), (0, 0.5, 0), (0, -0.5, 0), (0.5, 0, 0), (-0.5, 
 
 
 def world(n_envs, source="box", n_agents=3, device="cpu", seed=1, friction=0.5, **arguments):
-    """Scenery, agents, and objects at random places, of which the last two cannot be moved."""
-    plans = sample(source, 4, seed=seed)
+    """Scenery, agents, and objects at random places, of which the last one cannot be moved. The
+    source "ramps" is a box with two ramps, and agents that stand before them.
+    """
+    ramps = source == "ramps"
+    plans = sample("box" if ramps else source, 4, seed=seed)
     scenery = scene.scenery(plans, n_agents, n_envs, device=device)
     agents = engine.Agents(n_envs, n_agents, device=device)
     shapes, sizes = [*SHAPES, "crate"], torch.tensor([*SIZES, 0.15], device=device)
+    if ramps:
+        shapes[:2] = "ramp", "ramp"
+        arguments |= dict(n_agents=n_agents, ramp_steps=4)
     movable = [True] * len(SHAPES) + [False]
     objects = engine.Objects(
         n_envs, shapes, [[1.0, 0, 0]], False, None, device, [*WIDTHS, 1.0], movable, **arguments
@@ -42,6 +48,12 @@ def world(n_envs, source="box", n_agents=3, device="cpu", seed=1, friction=0.5, 
         engine.spawn(scenery, agents, everyone, points, drawn, seed)
         mask = bad[:, None].expand_as(objects.visible).contiguous()
         engine.place_objects(scenery, agents, mask, points, placed, seed, 0.01)
+        if ramps:
+            angles = objects.angles[bad, :2]
+            x, y = angles.deg2rad().cos(), angles.deg2rad().sin()
+            before = torch.stack([x, y], -1) * (sizes[:2, None] + 0.2)
+            agents.positions[bad, :2] = objects.positions[bad, :2] - before
+            agents.angles[bad, :2] = angles + 10
         bad = (overlaps(scenery, agents) > 0).to(device)
     return scenery, agents, random
 
@@ -68,6 +80,9 @@ def corners(scenery, agents):
     bodies = o.positions.double().cpu(), torch.stack([x, y], -2), sizes * is_disc
     of_walls = walls_of(scenery)
     at = agents.positions.double().cpu()
+    if o.elevated is not None:  # those who are, or are on a ramp, are far from all else
+        far = 1e3 + 1e3 * torch.arange(at.shape[1]).double()
+        at = torch.where((o.elevated.cpu() != 0)[..., None], far[:, None], at)
     of_agents = at, torch.zeros(*at.shape, 2).double(), torch.full(at.shape[:2], agents.radius)
     return [torch.cat(parts, 1) for parts in zip(of_agents, bodies, of_walls)]
 

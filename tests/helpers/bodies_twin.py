@@ -2,7 +2,8 @@
 It shares no code with the kernels.
 
 A slot is a dict: at (2,), angle (degrees), half (2,) of a rectangle or radius of a disc, v (2,), w
-(rad/s), m and i (inverse mass and inertia), wish (2,), limit (newtons from the floor).
+(rad/s), m and i (inverse mass and inertia), wish (2,), limit (newtons from the floor). Agents may
+have `elevated`, and bodies be ramps with `steps`.
 """
 
 import numpy as np
@@ -136,9 +137,39 @@ def floor(s, v, w, h, done):
     done[s["n"]] = j, turn
 
 
+def climb(agent, bodies, seconds):
+    """What an agent passes in this step: bodies if above 0, below 0 the ramp -1 - elevated."""
+    up = agent.get("elevated", 0)
+    near = [min([gap for gap, _ in touch(agent, b)[1]] or [1]) for b in bodies]
+    if up > 1 or (up == 1 and min(near) >= 0):
+        up -= 1
+    elif up < 0 and near[-1 - up] >= 0:
+        up = 0
+    fastest = max(np.linalg.norm(agent["v"]), np.linalg.norm(agent["wish"]))
+    radius = agent["radius"]
+    way = radius + seconds * (fastest + abs(agent["w"]) * radius)
+
+    def along(b):
+        x, y = axes(b)
+        return x @ (agent["at"] - b["at"]), abs(y @ (agent["at"] - b["at"]))
+
+    for k, b in enumerate(bodies):
+        if up == 0 and "steps" in b and axes(b)[0] @ agent["wish"] > 0:
+            (x, y), (length, width) = along(b), b["half"]
+            if -length - way < x < -length and y <= width:
+                up = -1 - k
+    if up < 0 and along(bodies[-1 - up])[0] + radius + 0.05 >= bodies[-1 - up]["half"][0]:
+        up = bodies[-1 - up]["steps"]
+    return up
+
+
 def step(slots, fixed, seconds):
     """Moves slots by a step, in place. `fixed` are walls and other objects."""
     h = seconds / SUBSTEPS
+    bodies = [s for s in slots if not s["is_agent"]]
+    for s in slots:
+        if s["is_agent"]:
+            s["elevated"] = climb(s, bodies, seconds)
     for n, s in enumerate([*slots, *fixed]):
         s["n"] = n
         s["extent"] = s["radius"] if "radius" in s else np.linalg.norm(s["half"])
@@ -158,7 +189,9 @@ def step(slots, fixed, seconds):
         found = []
         for k, a in enumerate(slots):
             for b in [*slots[k + 1 :], *fixed]:
-                if a["m"] or b["m"]:
+                is_body = any(b is s for s in bodies)
+                up = a.get("elevated", 0) if is_body else 0
+                if (a["m"] or b["m"]) and not (up > 0 or (up < 0 and b is bodies[-1 - up])):
                     normal, points = touch(a, b)
                     reach = (limit * h + MAX_SHIFT) * (2 if b["n"] < len(slots) else 1)
                     if points and min(gap for gap, _ in points) < reach:

@@ -8,7 +8,9 @@ import torch
 
 from megastep import engine, modules, scene, toys
 from megastep.core import Core
-from megastep.modules import Crate, Disc, Objects
+from megastep.engine.state_tree import restore, snapshot
+from megastep.modules import Crate, Disc, Objects, Ramp
+from tests.helpers import bodies
 
 PAGE = Path(__file__).parents[2] / "docs/objects.md"
 AHEAD, TURN_LEFT, STAND = 3, 5, 0
@@ -110,6 +112,82 @@ def test_nobody_moves_what_is_locked_and_its_team_alone_unlocks_it(device):
     assert torch.equal(before, box.positions)
 
 
+def test_an_agent_drives_up_a_ramp_and_over_boxes_up_to_the_wall(device):
+    """From the low side alone: from the other three it pushes the ramp."""
+    kinds = {"ramp": Ramp(1), "box": Crate(1, 0.4, movable=True)}
+    core, objects, act = room(kinds, n_envs=4, device=device, ramp_steps=8)
+    ramp, box, elevated = objects["ramp"], objects["box"], objects.all.elevated
+    put(ramp, (2.6, 3.1))
+    put(box, (3.2, 3.0))
+    ramp.angles[:, 0] = torch.tensor([0.0, 90, 180, -90])
+    ups = [elevated[:, 0].tolist() for _ in range(50) if act(AHEAD)]
+    first = ups.index([8, 0, 0, 0])
+    assert [up for up, *_ in ups[first:]] == [*range(8, 0, -1)] + [0] * (42 - first)
+    assert {up for up, *_ in ups[:first]} == {0, -1} and not any(map(any, (u[1:] for u in ups)))
+    way = (ramp.positions - torch.tensor([2.6, 3.1], device=device)).norm(dim=-1)[:, 0]
+    assert way[0] == 0 and (way[1:] > 0.3).all()
+    assert torch.equal(box.positions[0].cpu(), torch.tensor([[3.2, 3.0]]))
+    gap = 6 - core.agents.radius - core.agents.positions[0, 0, 0]
+    assert gap.item() == pytest.approx(0, abs=6e-3)
+
+
+def test_who_is_over_a_box_stays_elevated_and_comes_down_with_a_new_episode(device):
+    kinds = {"ramp": Ramp(1), "box": Crate(1, 1.5, movable=True)}
+    core, objects, act = room(kinds, device=device, ramp_steps=2)
+    elevated = objects.all.elevated
+    put(objects["ramp"], (2.5, 3.0))
+    put(objects["box"], (3.6, 3.0))
+    for _ in range(15):
+        act(AHEAD)
+    assert elevated.eq(1).all() and core.agents.positions[..., 0].sub(3.5).abs().max() < 0.1
+    saved = snapshot((core, objects))
+    ends = []
+    for _ in "ab":
+        restore((core, objects), saved)
+        ends.append([(act(AHEAD), elevated.clone())[1] for _ in range(12)])
+    assert all(map(torch.equal, *ends)) and ends[0][0].all() and not ends[0][-1].any()
+    assert (objects["box"].positions[..., 0] == 3.6).all()
+    restore((core, objects), saved)
+    only_first = torch.tensor([True, False], device=device)
+    modules.RandomSpawns([toys.box()], core)(only_first)
+    assert elevated.tolist() == [[0], [1]]
+
+
+@pytest.mark.parametrize("may_grab", [False, True])
+def test_an_elevated_agent_rides_on_a_box_if_it_may_grab(may_grab):
+    kinds = {"ramp": Ramp(1, width=0.2), "box": Crate(2, 0.4, movable=True, mass=0.5)}
+    core, objects, act = room(kinds, ramp_steps=2, grab_elevated=may_grab)
+    box, elevated = objects["box"], objects.all.elevated
+    put(objects["ramp"], (2.6, 3.0))
+    put(box, (3.1, 2.9), (2.0, 3.33))
+    box.grab(torch.tensor([[False, True]]).expand(2, 1, 2))
+    for _ in range(12):
+        act(AHEAD)
+    assert elevated.eq(1).all() and box.held()[..., 1].eq(may_grab).all()
+    box.release(torch.ones((2, 1), dtype=torch.bool))
+    box.grab(torch.tensor([[True, False]]).expand(2, 1, 2))
+    for _ in range(12):
+        act(AHEAD)
+    assert (box.positions[:, 0, 0] > 4).eq(may_grab).all() and elevated.eq(int(may_grab)).all()
+
+
+def test_agents_that_come_down_in_bodies_are_pushed_out_slowly():
+    """As an environment may have them, also in those that are locked."""
+    scenery, agents, random = bodies.world(64, "ramps", seed=4)
+    o, depths = scenery.objects, []
+    inside = torch.rand((64, 3, 2), generator=random) - 0.5
+    agents.positions.copy_(o.positions[:, :3] + 0.2 * inside)
+    o.locked.copy_(torch.rand(o.locked.shape, generator=random) < 0.3)
+    for _ in range(60):
+        before, places = agents.positions.clone(), o.positions.clone()
+        moves = torch.randint(9, (64, 3), generator=random)
+        engine.physics(scenery, agents, moves, bodies.MOVES, 0.5)
+        depths.append(bodies.overlaps(scenery, agents).amax())
+        assert (agents.positions - before).norm(dim=-1).max() < 0.25  # 1.1 m/s, and 4 x 2 cm
+        assert (o.positions - places).norm(dim=-1).max() < 0.2
+    assert depths[0] > 0.2 and depths[30] < depths[0] / 2 and depths[-1] < 0.006
+
+
 def test_placed_objects_rest_and_keep_clear_corners_included():
     kinds = {"box": Crate(4, 0.6, movable=True, width=0.2), "ball": Disc(2, 0.2, movable=True)}
     core, objects, act = room(kinds, n_envs=64)
@@ -153,6 +231,8 @@ def test_cameras_see_an_elongated_box_where_it_was_pushed():
         ({"box": Crate(1, movable=True, friction=-1)}, "friction of box must be a number between"),
         ({"box": Crate(1, 30.0, movable=True, width=1.0)}, "no point in a room"),
         ({"box": Crate(1, 1.0, width=2.0)}, "width of box must be a number between 0 and 1"),
+        ({"ramp": Ramp(9), "box": Crate(8, 0.1, movable=True)}, "at most 16 movable objects, but"),
+        ({"ramp": Ramp(1, width=0.7)}, "width of ramp must be a number between 0 and 0.6"),
     ],
 )
 def test_bad_kinds_are_named(kinds, message):

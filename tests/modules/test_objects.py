@@ -198,7 +198,7 @@ def test_a_state_is_drawn_with_its_objects():
     "kinds, source, message",
     [
         ({"key": 0}, "homes", "the number of key must be an integer from 1"),
-        ({"key": "disc"}, "homes", "key must be a number, Disc, Crate or Door"),
+        ({"key": "disc"}, "homes", "key must be a number, Disc, Crate, Ramp or Door"),
         ({"key": Disc(1, -1.0)}, "homes", "radius of key must be a number between 0"),
         ({"door": Door()}, "maze", "door: none of the geometries has a doorway"),
         ({}, "homes", "kinds must hold at least one"),

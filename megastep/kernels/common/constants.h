@@ -21,10 +21,11 @@ constexpr int BAD_CARRIER = 8;  // a carrier that is no agent
 constexpr int OUTSIDE = 9;      // a position outside of the home
 constexpr int NO_ROOM = 10;     // nowhere to put it
 
-// Shapes of objects: a hexagon in a disc, a square, a segment.
+// Shapes of objects: a hexagon in a disc, a square, a segment, a square without its low side.
 constexpr int DISC = 0;
 constexpr int CRATE = 1;
 constexpr int DOOR = 2;
+constexpr int RAMP = 3;
 constexpr int OBJECT_BYTES = 32;  // of a record
 constexpr int BODY_BYTES = 48;
 constexpr int MAX_BODIES = 16;  // objects of an environment that can be pushed

@@ -37,7 +37,7 @@ struct ALIGNED Body {
 static_assert(sizeof(Body) == BODY_BYTES, "Python views its fields");
 
 struct ObjectsParams {
-    const int* shapes;       // (O) DISC, CRATE or DOOR
+    const int* shapes;       // (O) DISC, CRATE, DOOR or RAMP
     const int* line_starts;  // (O + 1) first line of each object
     const int* line_object;  // (L) the object of each line
     const float* palette;    // (P, 3) linear light
@@ -54,6 +54,9 @@ struct ObjectsParams {
     const int* body_objects;   // (B) the object that each body is
     const int* object_bodies;  // (O) the body that each object is; -1: none
     int n_bodies;              // B
+    // (N, A) in and out. Above 0: steps in which the agent still passes bodies. Below: -1 - body,
+    // of the ramp that it drives up, and passes. Null: there are no ramps.
+    int* elevated;
 };
 
 HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
