@@ -18,7 +18,7 @@ from megastep.agents.factory import settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.selfplay.bots import BOTS
-from megastep.agents.selfplay.mixed_policy import rotating_slots
+from megastep.agents.selfplay.mixed_policy import rotating_teams, teams_of
 from megastep.arrdict import arrdict
 from megastep.env_state import way_back
 from megastep.types import Env, PolicyLike, optional
@@ -51,14 +51,15 @@ class EvalEnv:
         seed: of spawns.
         is_shared: the ranks share the environments. Otherwise each makes all of them.
         is_duel: makes environments for two where the number of agents can be set, an episode each,
-            as many in each home as there are slots, or a multiple. Raises UserError for one agent.
+            as many in each home as there are teams (slots, without roles), or a multiple. Raises
+            UserError for one agent.
 
     Attributes:
         env, sample: the environment, with this rank's share of all lanes, and a small one.
         settings: those of `env`.
         homes: the geometries played in.
         shard: this rank's share.
-        slots: (n_envs, 1) int64, the slot of the agent that is evaluated, in duels.
+        own: (n_envs, n_agents) bool, the agents that are evaluated, in duels.
     """
 
     def __init__(
@@ -74,12 +75,13 @@ class EvalEnv:
         env = settings.changed_known(env, **(FOR_TWO if is_duel else {"resample": False}))
         self.seed = rank_seed(seed, process_group.rank() if is_shared else 0)
         self.sample = factory.make_sample(env, [*homes], seed=self.seed, device=device)
-        n_agents = optional(self.sample, "n_agents")
+        n_agents, teams = optional(self.sample, "n_agents"), teams_of(self.sample)
         if is_duel:
             check_duels(self.sample)
-            n_homes = max(1, episodes // n_agents)  # from each slot
+            n_teams = len(teams.unique())
+            n_homes = max(1, episodes // n_teams)  # from each side
             n_homes -= n_homes % min(n_homes, max(1, len(homes)))
-            n_envs = n_homes * n_agents
+            n_envs = n_homes * n_teams
         else:
             n_envs = -(-episodes // n_agents)
             n_envs += -n_envs % len(homes) if n_envs > len(homes) > 0 else 0
@@ -89,7 +91,7 @@ class EvalEnv:
         self.settings = settings.changed(env, n_envs=len(self.shard.envs))
         self.device, self._go_back, self._is_used = device, None, False
         self.env: Env = self._made()
-        self.slots = rotating_slots(n_envs, n_agents, self.env.device)[[*self.shard.envs]]
+        self.own = rotating_teams(n_envs, teams)[[*self.shard.envs]]
 
     def _made(self) -> Env:
         homes = [self.homes[home] for home in self.shard.homes]
@@ -139,7 +141,7 @@ class EvalEnv:
     ) -> arrdict:
         """Returns the duels of two players, those of all ranks."""
         policy, other = self.begin(run, player, opponent)
-        how = self.seed, cfg.greedy, cfg.max_steps or playing.MAX_STEPS, self.slots
+        how = self.seed, cfg.greedy, cfg.max_steps or playing.MAX_STEPS, self.own
         with factory.errors():
             played = playing.first_duels(self.env, policy, other, *how)
         return self.shard.with_others(played)

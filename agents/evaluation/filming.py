@@ -4,8 +4,6 @@ import itertools
 from pathlib import Path
 from typing import cast
 
-import torch
-
 from megastep import recording
 from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
@@ -14,7 +12,8 @@ from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.runs import folders, restore
 from megastep.agents.selfplay.bots.random import RandomActions
-from megastep.types import PolicyLike, optional
+from megastep.agents.selfplay.mixed_policy import teams_of
+from megastep.types import PolicyLike
 
 
 def run(cfg: settings.Record) -> Path:
@@ -78,5 +77,6 @@ def _player(cfg, loaded, first, env_settings, env) -> PolicyLike:
     eval_env.check_duels(env)
     opponent = eval_env.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
     console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
-    slot = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
-    return playing.duel_policy(policy, opponent.policy, slot, optional(env, "n_agents"))
+    teams = teams_of(env)
+    own = (teams == teams[0]).expand(env.n_envs, -1)
+    return playing.duel_policy(policy, opponent.policy, own)

@@ -10,7 +10,12 @@ from torch.utils import _pytree
 
 from megastep.agents import console
 from megastep.agents.generator import SeededGenerator
-from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_slots, score_pairs
+from megastep.agents.selfplay.mixed_policy import (
+    MixedPolicy,
+    rotating_teams,
+    score_pairs,
+    teams_of,
+)
 from megastep.agents.storage.collector import capture_with
 from megastep.arrdict import arrdict
 from megastep.types import Env, PolicyLike, Tree, World, n_lanes, optional
@@ -156,14 +161,10 @@ def first_episodes(
 # ---- Duels ----
 
 
-def duel_policy(
-    policy: PolicyLike, opponent: PolicyLike, slots: torch.Tensor, n_agents: int
-) -> MixedPolicy:
-    """Returns a policy that is `policy` in slots (N, 1) int64, and `opponent` in all others."""
-    in_slot = torch.zeros(len(slots), n_agents, dtype=torch.bool, device=slots.device)
-    in_slot = in_slot.scatter(1, slots, True).flatten()
-    lanes = torch.arange(len(in_slot), device=slots.device)
-    return MixedPolicy([policy, opponent], [lanes[in_slot], lanes[~in_slot]])
+def duel_policy(policy: PolicyLike, opponent: PolicyLike, own: torch.Tensor) -> MixedPolicy:
+    """Returns a policy that is `policy` for some agents, (N, A) bool, `opponent` for the others."""
+    lanes = torch.arange(own.numel(), device=own.device)
+    return MixedPolicy([policy, opponent], [lanes[own.flatten()], lanes[~own.flatten()]])
 
 
 @torch.no_grad()
@@ -174,28 +175,29 @@ def first_duels(
     seed: int = 1,
     greedy: bool = False,
     max_steps: int = MAX_STEPS,
-    slots: torch.Tensor | None = None,
+    own: torch.Tensor | None = None,
 ) -> arrdict:
     """Plays one duel per environment, from a reset.
 
     A duel ends at the first step that is terminal for any of its agents; `score_pairs` decides who
     won. It is a draw if the episode is truncated or `max_steps` is reached first. With more than
     two agents, `opponent` controls all the others, and the score is the mean over decided pairs.
+    Agents of one role are a team: `policy` controls one team and `opponent` the others.
 
     Args:
         seed: of the action sampling.
         greedy: takes the most likely actions instead of sampling.
-        slots: (N, 1) int64, the agent that `policy` controls; by default `rotating_slots`.
+        own: (N, A) bool, the agents that `policy` controls; by default `rotating_teams`.
 
     Returns:
         An arrdict of `score`, float32: 1 if `policy` won, 0 if it lost, 0.5 for a draw; `lengths`,
-        float32 steps; `slots`, int64, the agent that `policy` controlled; and, if `env.layout`
-        exists, `homes`, int32, the layouts after the reset: (N,) each.
+        float32 steps; `slots`, int64, the first agent that `policy` controlled; and, if
+        `env.layout` exists, `homes`, int32, the layouts after the reset: (N,) each.
     """
     device, shape = torch.device(env.device), (env.n_envs, optional(env, "n_agents"))
     draws = SeededGenerator(seed)
-    slots = rotating_slots(*shape, device) if slots is None else slots
-    both = duel_policy(policy, opponent, slots, shape[1])
+    own = rotating_teams(env.n_envs, teams_of(env)) if own is None else own
+    both = duel_policy(policy, opponent, own)
     world, state = env.reset(), both.initial(n_lanes(env), device)
     layout = optional(env, "layout")
     homes = {} if layout is None else {"homes": layout.clone()}
@@ -209,7 +211,7 @@ def first_duels(
         truncated: torch.Tensor = world.truncated.view(shape)
         returns.add_(world.reward.view(shape))
         lengths.add_(~is_over)
-        won, decided = score_pairs(terminal, returns, slots)
+        won, decided = score_pairs(terminal, returns, own)
         score.copy_(torch.where((decided > 0) & ~is_over, won / decided, score))
         is_over.logical_or_((terminal | truncated).any(1))
         return world, state
@@ -217,4 +219,4 @@ def first_duels(
     changed = both, draws, returns, lengths, score
     step_until(is_over, step, world, state, env, (policy, opponent), changed, max_steps)
     optional(env, "check")()
-    return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)
+    return arrdict(score=score, lengths=lengths, slots=own.int().argmax(1), **homes)

@@ -11,7 +11,7 @@ import torch
 
 from megastep.agents.storage.copies import select_tree
 from megastep.arrdict import arrdict, cat
-from megastep.types import PolicyLike, Tree, World
+from megastep.types import Env, PolicyLike, Tree, World, optional
 
 
 class MixedPolicy:
@@ -98,9 +98,9 @@ class MixedPolicy:
 
 
 def score_pairs(
-    terminal: torch.Tensor, returns: torch.Tensor, slots: torch.Tensor
+    terminal: torch.Tensor, returns: torch.Tensor, own: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Scores one agent of each environment against each other agent, on a single step.
+    """Scores the agents of one team per environment against each other agent, on a single step.
 
     A pair is decided when either agent's episode is terminal. If only one is, the other agent has
     won. If both are, as in a game that ends for all, the higher return wins, and equal returns are
@@ -109,22 +109,31 @@ def score_pairs(
     Args:
         terminal: (N, A) bool, of this step.
         returns: (N, A), rewards since each agent's episode began.
-        slots: (N, 1) int64, the agent that is scored.
+        own: (N, A) bool, the agents that are scored.
 
     Returns:
         Two (N,) float32: pairs won, with a draw as half, and pairs decided.
     """
-    slot_terminal, slot_return = terminal.gather(1, slots), returns.gather(1, slots)
-    sign = torch.where(
-        terminal == slot_terminal, slot_return - returns, terminal.float() - slot_terminal.float()
-    ).sign()
-    decided = (terminal | slot_terminal).scatter(1, slots, False)
-    won = torch.where(decided, (1 + sign) / 2, 0.0).sum(1)
-    return won, decided.float().sum(1)
+    ours, theirs = terminal[:, :, None], terminal[:, None]
+    ahead = returns[:, :, None] - returns[:, None]
+    sign = torch.where(ours == theirs, ahead, theirs.float() - ours.float()).sign()
+    decided = own[:, :, None] & ~own[:, None] & (ours | theirs)
+    won = torch.where(decided, (1 + sign) / 2, 0.0).sum((1, 2))
+    return won, decided.float().sum((1, 2))
 
 
-def rotating_slots(
-    n_envs: int, n_agents: int, device: torch.device | str | None = None
-) -> torch.Tensor:
-    """Returns one slot per environment, (N, 1) int64: 0 for the first N / A, and so on."""
-    return (torch.arange(n_envs, device=device) * n_agents // n_envs)[:, None]
+def teams_of(env: Env) -> torch.Tensor:
+    """Returns the team of each agent, (A,) int64: its role, or itself without different roles."""
+    roles, n_agents = optional(env, "roles") or (), optional(env, "n_agents")
+    names = [*dict.fromkeys(roles)]
+    teams = [names.index(role) for role in roles] if len(names) > 1 else [*range(n_agents)]
+    return torch.tensor(teams, device=env.device)
+
+
+def rotating_teams(n_envs: int, teams: torch.Tensor) -> torch.Tensor:
+    """Returns the agents of one team per environment, (N, A) bool: those of team 0 in the first N
+    environments / number of teams, and so on.
+    """
+    n_teams = len(teams.unique())
+    team = torch.arange(n_envs, device=teams.device) * n_teams // n_envs
+    return teams == team[:, None]

@@ -13,7 +13,12 @@ from pydantic import Field, SkipValidation
 
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
-from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_slots, score_pairs
+from megastep.agents.selfplay.mixed_policy import (
+    MixedPolicy,
+    rotating_teams,
+    score_pairs,
+    teams_of,
+)
 from megastep.agents.storage.rollout import copy_tree
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
@@ -32,9 +37,10 @@ class Opponents:
     scripted bot play some agents.
 
     In an environment with opponents, one agent learns and a single opponent controls all others.
-    The learning agent's slot rotates across environments. In the remaining environments, which come
-    first, the current policy controls every agent and learns from all of them. Opponents' lanes
-    have `learns` False, and `step` ignores the decision's actions in them.
+    The learning agent's slot rotates across environments. If agents have different roles, those of
+    a role are a team, and a team learns instead of an agent. In the remaining environments, which
+    come first, the current policy controls every agent and learns from all of them. Opponents'
+    lanes have `learns` False, and `step` ignores the decision's actions in them.
 
     Args:
         env: environment with at least two agents.
@@ -91,12 +97,13 @@ class Opponents:
         kinds = {"past": len(self.snapshots), "league": len(self.rivals), "bot": int(bot > 0)}
         n_each = [self.n_by_kind[kind] // n for kind, n in kinds.items() for _ in range(n)]
         self.n_opposed = sum(n_each)
-        self.slots = torch.cat([rotating_slots(n, self.n_agents, device) for n in n_each])  # (M, 1)
+        teams = teams_of(env)
+        own = [rotating_teams(n, teams) for n in n_each]
+        self.own = torch.cat(own)  # (M, A)
         learners = torch.ones(env.n_envs, self.n_agents, dtype=torch.bool, device=device)
-        learners[-self.n_opposed :] = torch.zeros_like(self.slots, dtype=torch.bool)
-        learners[-self.n_opposed :].scatter_(1, self.slots, True)
+        learners[-self.n_opposed :] = self.own
         self.learners = learners.flatten()
-        lanes = (~self.learners).nonzero()[:, 0].split([n * (self.n_agents - 1) for n in n_each])
+        lanes = (~self.learners).nonzero()[:, 0].split([int((~part).sum()) for part in own])
         bots = [] if self.scripted is None else [self.scripted]
         self.mixed_policy = MixedPolicy([*self.copies, *bots], lanes)
         n_by_kind = {"now": env.n_envs - self.n_opposed, **self.n_by_kind}
@@ -164,13 +171,13 @@ class Opponents:
         if reward.is_cuda and reward.dtype == torch.float32:
             launch(
                 *(LIBRARY, "count_pairs", reward.device, self.n_opposed),
-                **dict(reward=reward, terminal=terminal, truncated=truncated, slots=self.slots),
+                **dict(reward=reward, terminal=terminal, truncated=truncated, own=self.own),
                 **dict(returns=self.returns, pairs=self.pairs),
                 **dict(n_envs=self.n_opposed, n_agents=self.n_agents),
             )
             return
         self.returns += reward
-        self.pairs += torch.stack(score_pairs(terminal, self.returns, self.slots))
+        self.pairs += torch.stack(score_pairs(terminal, self.returns, self.own))
         self.returns.masked_fill_(terminal | truncated, 0.0)
 
     def refresh_snapshots(self, policy: Policy, n_updates: int) -> None:

@@ -74,6 +74,13 @@ def test_first_death_loses():
     assert played.slots.bincount().tolist() == [4, 4, 4, 4]
 
 
+def test_teams_duel_where_agents_have_roles():
+    env = Matrix(8, 3, roles=("prey", "hunter", "hunter"))
+    played = playing.first_duels(env, Always(2), Always(0))
+    assert (played.score == 1).all() and played.slots.tolist() == [0] * 4 + [1] * 4
+    assert env.played[0].tolist() == [[2, 0, 0]] * 4 + [[0, 2, 2]] * 4
+
+
 def test_intervals_are_over_homes():
     env = Matrix(8)
     env.layout = torch.arange(4, dtype=torch.int32).repeat(2)

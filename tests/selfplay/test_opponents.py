@@ -3,6 +3,7 @@ are refreshed and saved, how wins are counted, and that a policy learns against 
 """
 
 import copy
+import itertools
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from megastep import contract, envs, toys
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs.saver import Saver
-from megastep.agents.selfplay.mixed_policy import score_pairs
+from megastep.agents.selfplay.mixed_policy import rotating_teams, score_pairs
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.storage.rollout import SEQUENCES
 from megastep.agents.training.budget import Budget
@@ -104,6 +105,22 @@ def test_fractions_of_environments_and_learning_slots():
         assert learners[first : first + 4, 0].tolist() == [True, True, False, False]
     assert env.mixed_policy.lanes.tolist() == [9, 11, 12, 14, 17, 19, 20, 22, 25, 27, 28, 30]
     assert env.mixed_policy.sizes == [4, 4, 4]
+
+
+def test_a_team_learns_and_opponents_play_the_other():
+    """Two hiders and a seeker: in half of the environments either learns."""
+    env = make_opponents(env=Matrix(16, 3, roles=("hider", "hider", "seeker")))
+    hiders, seeker = [True, True, False], [False, False, True]
+    learners = env.learners.view(16, 3).tolist()
+    assert learners == [[True] * 3] * 4 + [hiders, hiders, seeker, seeker] * 3
+    assert env.mixed_policy.sizes == [6, 6, 6]
+    env.reset()
+    env.step(arrdict(actions=torch.ones(48, 1, dtype=torch.int64)))
+    played = env.env.played[-1]
+    assert (played[env.learners.view(16, 3)] == 1).all()
+    assert (played[12:14, 2] == 2).all() and (played[14:, :2] == 2).all(), "the bot"
+    # the bot's 2 beats a 1 in each of its two pairs
+    assert env.pairs[:, -4:].tolist() == [[0.0] * 4, [2.0] * 4]
 
 
 @pytest.mark.parametrize("n_agents", [2, 3, 5])
@@ -282,13 +299,13 @@ def test_refresh_replaces_the_oldest_snapshot_in_place():
 # ---- Wins ----
 
 
-def slow_score_pairs(terminal, returns, slots):
+def slow_score_pairs(terminal, returns, own):
     """`score_pairs`, pair by pair."""
     won, decided = [], []
-    for is_terminal, total, me in zip(terminal.tolist(), returns.tolist(), slots[:, 0].tolist()):
-        scores = []
-        for i in range(len(is_terminal)):
-            if i == me or not (is_terminal[i] or is_terminal[me]):
+    for is_terminal, total, ours in zip(terminal.tolist(), returns.tolist(), own.tolist()):
+        scores, slots = [], range(len(ours))
+        for me, i in itertools.product(slots, slots):
+            if not ours[me] or ours[i] or not (is_terminal[i] or is_terminal[me]):
                 continue
             if is_terminal[i] and is_terminal[me]:
                 scores.append(0.5 if total[i] == total[me] else float(total[me] > total[i]))
@@ -304,16 +321,17 @@ def test_pairs_are_won_by_survival_and_else_by_return(n_agents):
     torch.manual_seed(1)
     terminal = torch.rand(500, n_agents) < 0.4
     returns = torch.randint(-2, 3, (500, n_agents)).float()
-    slots = torch.randint(n_agents, (500, 1))
-    won, decided = score_pairs(terminal, returns, slots)
-    assert (won.tolist(), decided.tolist()) == slow_score_pairs(terminal, returns, slots)
+    for own in (torch.rand(500, n_agents) < 0.5, rotating_teams(500, torch.arange(n_agents))):
+        won, decided = score_pairs(terminal, returns, own)
+        assert (won.tolist(), decided.tolist()) == slow_score_pairs(terminal, returns, own)
 
 
-@pytest.mark.parametrize("n_agents", [2, 5])
-def test_pairs_of_a_gpu_are_those_of_the_cpu(n_agents, to_gpu):
+@pytest.mark.parametrize("roles", ["ab", "abcde", "abaab"])
+def test_pairs_of_a_gpu_are_those_of_the_cpu(roles, to_gpu):
     torch.manual_seed(1)
-    envs = [make_opponents(600, n_agents, past=0.0, bot=0.9) for _ in range(2)]
-    for name in ("returns", "pairs", "slots"):
+    n_agents, of_roles = len(roles), Matrix(600, len(roles), roles=[*roles])
+    envs = [make_opponents(env=of_roles, past=0.0, bot=0.9) for _ in range(2)]
+    for name in ("returns", "pairs", "own"):
         setattr(envs[1], name, to_gpu(getattr(envs[1], name)))
     for _ in range(5):
         terminal = torch.rand(600 * n_agents) < 0.3

@@ -7,21 +7,25 @@ KERNEL count_pairs(CountPairsParams p) {
     int env = blockIdx.x * blockDim.x + threadIdx.x;
     if (env >= p.n_envs)
         return;
-    long long first = (long long)env * p.n_agents, slot = first + p.slots[env];
-    float own = p.returns[slot] + p.reward[slot], won = 0.f, decided = 0.f;
-    bool dies = p.terminal[slot];
-    for (long long i = first; i < first + p.n_agents; i++) {
-        float total = p.returns[i] + p.reward[i];
-        bool other_dies = p.terminal[i];
-        p.returns[i] = other_dies || p.truncated[i] ? 0.f : total;
-        if (i == slot || !(dies || other_dies))
-            continue;
-        decided += 1.f;
-        if (dies != other_dies)
-            won += other_dies ? 1.f : 0.f;
-        else
-            won += own > total ? 1.f : own < total ? 0.f : .5f;
+    long long first = (long long)env * p.n_agents, end = first + p.n_agents;
+    float won = 0.f, decided = 0.f;
+    for (long long i = first; i < end; i++)
+        p.returns[i] += p.reward[i];
+    for (long long i = first; i < end; i++) {
+        for (long long j = first; p.own[i] && j < end; j++) {
+            bool dies = p.terminal[i], other_dies = p.terminal[j];
+            if (p.own[j] || !(dies || other_dies))
+                continue;
+            float own = p.returns[i], other = p.returns[j];
+            decided += 1.f;
+            if (dies != other_dies)
+                won += other_dies ? 1.f : 0.f;
+            else
+                won += own > other ? 1.f : own < other ? 0.f : .5f;
+        }
     }
+    for (long long i = first; i < end; i++)
+        p.returns[i] = p.terminal[i] || p.truncated[i] ? 0.f : p.returns[i];
     p.pairs[env] += won;
     p.pairs[p.n_envs + env] += decided;
 }
