@@ -90,7 +90,8 @@ class Core:
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`: walls and their lit texels, lights,
         agents' poses and how far their cameras see, objects. A film adds ``trail``, (T, A, 2), and
-        ``views``, (T, A, C, R + 1, 2); see :func:`megastep.recording.film`.
+        ``views``, (T, A, C, R + 1, 2); see :func:`megastep.recording.film`. An environment may add
+        ``teams``, (A,) integers, by which agents are coloured then.
         """
         core = self.alone(e)
         agents, scenery, objects = core.agents, core.scenery, core.scenery.objects
@@ -125,6 +126,11 @@ class Core:
                 widths=objects.widths[there],
                 colours=objects.palette[objects.colours[0][there].long()],
             )
+            if objects.n_bodies:
+                body = objects.object_bodies[there].long()
+                for name in ("holders", "owners"):  # -1 of what is no body, too
+                    values = torch.where(body < 0, -1, getattr(objects, name)[0][body])
+                    state["objects"][name] = values
         return state
 
     @staticmethod
@@ -132,7 +138,8 @@ class Core:
         state: arrdict, ax: "Area | Axes | None" = None, seen: np.ndarray | None = None
     ) -> "Area | Axes":
         """Draws a numpyified :meth:`state` from above: rooms, walls, objects, agents in their
-        colours with what they see, and in films where they were. Returns what it is drawn on.
+        colours with what they see and a line to what they hold, and in films where they were. What
+        a team locked has an outline in its colour. Returns what it is drawn on.
 
         Args:
             state: from :meth:`state`, as numpy arrays.
@@ -154,13 +161,21 @@ class Core:
             state.get("objects", arrdict(shapes=())),
             {n: s for s, n in NUMBERS.items()},
         )
+        n_agents, n_cameras = len(state.positions), len(state.yaws)
+        palette, n_colours = plotting.AGENTS, len(plotting.AGENTS)
+        teams = state.get("teams", np.arange(n_agents)) % n_colours
+        nobody = np.full(len(objects.shapes), -1)
+        owners, holders = (objects.get(name, nobody) for name in ("owners", "holders"))
         for k, shape in enumerate(objects.shapes):
             pose = objects.positions[k], objects.angles[k], objects.sizes[k]
             colour, width = gamma_encode(objects.colours[k]), float(objects.widths[k])
-            plotting.plot_object(area, names[int(shape)], *pose, colour, width)
-        n_agents, n_cameras = len(state.positions), len(state.yaws)
+            edge = None if owners[k] < 0 else palette[owners[k] % n_colours]
+            plotting.plot_object(area, names[int(shape)], *pose, colour, width, edge)
+            if holders[k] >= 0:
+                start, team = state.positions[holders[k]], teams[holders[k]]
+                plotting.plot_hold(area, start, objects.positions[k], palette[team])
         for a, (position, angle) in enumerate(zip(state.positions, state.angles, strict=True)):
-            colour = plotting.AGENTS[a % len(plotting.AGENTS)]
+            colour = palette[teams[a]]
             of_cameras = [colour] if n_cameras == 1 else plotting.camera_colours(n_cameras)
             for c, (yaw, mark) in enumerate(zip(state.yaws, of_cameras, strict=True)):
                 plotting.plot_view(

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 _MODULES = {
     "megastep.colour": "gamma_decode gamma_encode",
     "megastep.plotting.styles": "AGENTS Style current styled",
-    "megastep.plotting.marks": "STRIP camera_colours plot_agent plot_goal plot_images plot_object "
-    "plot_shot plot_trail plot_view view_polygon",
+    "megastep.plotting.marks": "STRIP camera_colours plot_agent plot_goal plot_hold plot_images "
+    "plot_object plot_shot plot_trail plot_view view_polygon",
     "megastep.plotting.plans": "plot_scenery wall_colours",
     "megastep.plotting.pictures": "Area Picture captioned encoded framed panels plot_level "
     "rasterise side_by_side",

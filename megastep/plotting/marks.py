@@ -123,6 +123,13 @@ def plot_shot(ax: Area | Axes, start: ArrayLike, end: ArrayLike, colour: str) ->
     area.disc(end, 0, SHOTS, fill="#ffffff", alpha=0.0, edge=colour, width=1.6, least=AGENT + 3)
 
 
+def plot_hold(ax: Area | Axes, holder: ArrayLike, held: ArrayLike, colour: str) -> None:
+    """Draws a line from an agent to what it holds, (2,) metres each."""
+    area = Area.on(ax)
+    area.line([holder, held], SHOTS, colour=colour, width=2.2)
+    area.disc(held, 0, SHOTS, fill=colour, edge="#ffffff", width=0.8, least=2.5)
+
+
 def plot_object(
     ax: Area | Axes,
     shape: str,
@@ -131,25 +138,32 @@ def plot_object(
     size: float,
     colour: ArrayLike,
     width: float = 1.0,
+    edge: str | None = None,
 ) -> None:
     """Draws a disc, a crate, a ramp or a door, as :class:`megastep.engine.Objects` has them; the
-    colour is (3,), sRGB. The width of a crate or ramp is a fraction of its length.
+    colour is (3,), sRGB. The width of a crate or ramp is a fraction of its length. A ramp has
+    arrows towards its high side. ``edge``: the colour of a bold outline, such as that of the team that locked it.
     """
     area, position = Area.on(ax), np.asarray(position, float)
-    fill, edge = tuple(np.asarray(colour, float)), area.style.colours.text
+    fill, line = tuple(np.asarray(colour, float)), 0.7 if edge is None else 2.8
+    edge = edge or area.style.colours.text
     ahead = size * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
     aside = np.array([-ahead[1], ahead[0]])
     if shape == "disc":
-        area.disc(position, size, OBJECTS, fill=fill, edge=edge, width=0.7, least=3)
+        area.disc(position, size, OBJECTS, fill=fill, edge=edge, width=line, least=3)
     elif shape == "crate":
         aside = width * aside
         corners = [ahead + aside, aside - ahead, -ahead - aside, ahead - aside]
-        area.polygon(position + np.array(corners), OBJECTS, fill=fill, edge=edge, width=0.7)
+        area.polygon(position + np.array(corners), OBJECTS, fill=fill, edge=edge, width=line)
     elif shape == "ramp":
         aside = width * aside
         corners = position + np.array([aside - ahead, ahead + aside, ahead - aside, -ahead - aside])
         area.polygon(corners, OBJECTS, fill=fill, alpha=0.5)
-        area.line(corners, OBJECTS, colour=edge, width=1.4)
+        area.line(corners, OBJECTS, colour=edge, width=2 * line)
+        for step in (-0.3, 0.1, 0.5):
+            tip = position + step * ahead
+            arrow = [tip - 0.4 * ahead + 0.5 * aside, tip, tip - 0.4 * ahead - 0.5 * aside]
+            area.line(arrow, OBJECTS, colour=area.style.colours.text, width=1.2)
     else:
         area.line([position - ahead, position + ahead], OBJECTS, colour=edge, width=4.6)
         area.line([position - ahead, position + ahead], OBJECTS, colour=fill, width=3.2)
