@@ -18,7 +18,7 @@ from megastep.agents.generator import stream_seed
 from megastep.agents.hardware import make_device as make_device
 from megastep.agents.hardware import share_threads
 from megastep.agents.networks.policy import Policy
-from megastep.agents.runs import checkpoint
+from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.runs.saver import check_plain
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.opponents import Opponents
@@ -215,10 +215,15 @@ def make_opponents(
 
 
 def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
-    """Returns a policy without weights, which takes one step in `env`; UserError if it cannot play.
-    `name` is one of `BOTS`, the import path of a class, or None, the class that is `env.bot`.
+    """Returns a policy that does not learn, which takes one step in `env`; UserError if it cannot
+    play. `name` is one of `BOTS`, the import path of a class, a run, whose agent it is, or None,
+    the class that is `env.bot`.
     """
     where = type(env).__name__
+    if name and name not in BOTS and ":" not in name:
+        return restore.policy_of(
+            folders.load_checkpoint(folders.find(name), False, env.device), env
+        )
     with errors():
         constructor = import_object(BOTS.get(name, name)) if name else optional(env, "bot")
     if constructor is None:

@@ -50,6 +50,7 @@ class Opponents:
             and against other members of a population, of which there are as many snapshots again.
         snapshots: number of snapshots. Each gets the same number of environments.
         every: updates between two refreshes; each replaces the oldest snapshot.
+        role: the role that learns against opponents. Default: each in equally many environments.
         seed: of the opponents' actions.
 
     Attributes, beside those of `env`:
@@ -62,7 +63,8 @@ class Opponents:
 
     Raises:
         ValueError: the environment has one agent, `past + league + bot` is 0 or above 1, `bot > 0`
-            without `scripted`, or a snapshot or the bot would get no environment.
+            without `scripted`, a snapshot or the bot would get no environment, or nobody has the
+            role.
     """
 
     @checked
@@ -77,6 +79,7 @@ class Opponents:
         league: Fraction = 0.0,
         snapshots: Annotated[int, Field(ge=1, le=10_000)] = 4,
         every: Annotated[int, Field(ge=1, le=10**9)] = 100,
+        role: str | None = None,
         seed: int = 1,
     ):
         self.env, self.every, device = env, every, env.device
@@ -99,6 +102,11 @@ class Opponents:
         self.n_opposed = sum(n_each)
         teams = teams_of(env)
         own = [rotating_teams(n, teams) for n in n_each]
+        if role is not None:
+            roles = optional(env, "roles") or ()
+            if role not in roles or len({*roles}) == 1:
+                raise ValueError(f"opponents.role={role} is none of {[*dict.fromkeys(roles)]}")
+            own = [(teams == teams[roles.index(role)]).expand(n, -1) for n in n_each]
         self.own = torch.cat(own)  # (M, A)
         learners = torch.ones(env.n_envs, self.n_agents, dtype=torch.bool, device=device)
         learners[-self.n_opposed :] = self.own

@@ -142,7 +142,7 @@ PONG = envs.Pong(2, self_play=True, device="cpu")
     "name, env, sentence",
     [
         *((n, PONG, f"{n} cannot play in Pong.*Pong has no core") for n in BOTS if n != "random"),
-        ("hunter", envs.PointGoal(1, HOMES[:1], device="cpu"), "observations d and health"),
+        ("hunter", envs.PointGoal(1, HOMES[:1], device="cpu"), "hunts others by the observation d"),
         ("explorer", Matrix(2), "explorer cannot play in Matrix"),
         ("oracle", envs.PointGoal(1, HOMES[:1], device="cpu"), "PointGoal has no cue"),
         ("hunted", PONG, "hunted"),

@@ -121,6 +121,10 @@ def test_a_team_learns_and_opponents_play_the_other():
     assert (played[12:14, 2] == 2).all() and (played[14:, :2] == 2).all(), "the bot"
     # the bot's 2 beats a 1 in each of its two pairs
     assert env.pairs[:, -4:].tolist() == [[0.0] * 4, [2.0] * 4]
+    one = make_opponents(env=Matrix(16, 3, roles=("hider", "hider", "seeker")), role="seeker")
+    assert one.learners.view(16, 3).tolist() == [[True] * 3] * 4 + [seeker] * 12
+    with pytest.raises(ValueError, match="role=hunter is none of .'hider', 'seeker'"):
+        make_opponents(env=Matrix(16, 3, roles=("hider", "hider", "seeker")), role="hunter")
 
 
 @pytest.mark.parametrize("n_agents", [2, 3, 5])

@@ -59,6 +59,16 @@ def test_metrics_by_kind_of_opponent(here):
     assert "bot, as right" in path.read_text(), "the environment's own"
 
 
+def test_one_role_learns_against_the_agent_of_a_run(here):
+    first = train.run(configured(f"samples={UPDATE}", tiny=PONG))
+    words = ["opponents.past=0", "opponents.bot=1", "opponents.role=right"]
+    words += [f"opponents.bot_class={first}", f"samples={6 * OPPOSED_UPDATE}"]
+    folder = train.run(configured(*words, tiny=OPPOSED))
+    last = json_lines.read(folder / "metrics.jsonl")[-1]
+    assert "episode/return/right" in last and "episode/return/left" not in last
+    assert train.main([*OPPOSED, "samples=100", "opponents.bot_class=runs/none"]) == 2
+
+
 class Configured(Always):
     """Takes settings of the environment as arguments."""
 

@@ -12,6 +12,7 @@ BOTS = {
     "mapper": "megastep.agents.selfplay.bots.seekers:Mapper",
     "oracle": "megastep.agents.selfplay.bots.seekers:Oracle",
     "random": "megastep.agents.selfplay.bots.random:RandomActions",
+    "runner": "megastep.agents.selfplay.bots.walker:Runner",
     "walker": "megastep.agents.selfplay.bots.walker:Walker",
     "wanderer": "megastep.agents.selfplay.bots.seekers:Wanderer",
 }

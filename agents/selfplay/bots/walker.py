@@ -1,6 +1,6 @@
-"""Bots that walk along shortest paths, that explore, and that play Deathmatch.
+"""Bots that walk along shortest paths, that explore, and that hunt, or run from who hunts.
 
-n lanes, A agents per environment, L landmarks per plan.
+n lanes, A agents per environment, L landmarks per plan, R agents of other teams.
 """
 
 import math
@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from megastep.agents.selfplay.bots.plans import BLOCKED
 from megastep.agents.selfplay.bots.steering import (
     HORIZON,
     SIGHT,
@@ -16,6 +17,7 @@ from megastep.agents.selfplay.bots.steering import (
     SteeredBot,
     Steering,
 )
+from megastep.agents.selfplay.mixed_policy import teams_of
 from megastep.arrdict import arrdict
 
 ARRIVED = 0.3  # metres
@@ -33,6 +35,10 @@ AIMING = 4.0  # how much aiming counts beside walking
 FINE, STEP = 3.0, 0.1  # degrees off within which it turns for the next step, in seconds
 SEARCHED = 3.0  # metres of floor around an agent lost from sight that it searches again
 CHASE = 60  # steps that it goes after an agent lost from sight
+
+# of a Runner
+UNSEEN = 20.0  # metres of a lead that it is worth that no hunter sees a landmark
+COST = 0.3  # metres of a lead that a metre of the way is worth
 
 
 class Walker(SteeredBot):
@@ -112,16 +118,23 @@ class Explorer(SteeredBot):
 
 
 class Hunter(Explorer):
-    """Explores until it sees another agent of a Deathmatch, then aims at it and approaches. It
-    searches around where it lost one from sight, and turns to the nearest when it is hit.
+    """Explores until it sees an agent of another team, then aims at it and approaches. It searches
+    around where it lost one from sight. If it observes its health, it turns to the nearest when it
+    is hit.
 
-    It knows what an `Explorer` knows, and the pose and velocity of the agents that it sees.
+    It knows what an `Explorer` knows, and the pose and velocity of the agents that it sees. Agents
+    of one of several `roles` are a team, in Deathmatch everybody is.
     """
 
     def __init__(self, env: Any):
         super().__init__(env)
-        if not {"d", "health"} <= {*env.obs_space} or env.n_agents < 2:
-            raise ValueError("it hunts by the observations d and health, as Deathmatch has them")
+        if "d" not in {*env.obs_space} or env.n_agents < 2:
+            raise ValueError("it hunts others by the observation d, as Deathmatch has them")
+        teams = teams_of(env)
+        rivals = [(teams != team).nonzero()[:, 0].tolist() for team in teams]
+        most = max(map(len, rivals))  # smaller teams' last ones are repeated
+        rivals = [(part * most)[:most] for part in rivals]
+        self.rivals = torch.tensor(rivals, device=env.device)  # (A, R) of each agent
 
     def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
         steering, obs = self.steering, world["obs"]
@@ -135,7 +148,9 @@ class Hunter(Explorer):
             target=torch.where(sees, lengths.argmin(1), state["target"]),
             patience=torch.where(sees, CHASE, state["patience"]),
         )
-        fights = (sees | (obs["health"][:, 0, 2] > 0))[:, None]
+        fights = sees[:, None]
+        if "health" in obs:
+            fights = fights | (obs["health"][:, 0, 2:] > 0)
         away = (other.position - pose.position).norm(dim=-1, keepdim=True)
         aim = steering.aim(pose, near, state["target"])
         aim = torch.where(fights & (away < APART), pose.position, aim)
@@ -155,14 +170,71 @@ class Hunter(Explorer):
     def _nearest(self, pose: Pose, depth: torch.Tensor) -> tuple[Pose, torch.Tensor]:
         """Of those in view first; and whether it is in view (n,)."""
         steering = self.steering
-        core, lanes, n_pixels = steering.core, steering.lanes[:, None], depth.shape[-1]
-        slots = lanes + torch.arange(1, core.n_agents, device=lanes.device)
-        others = lanes - lanes % core.n_agents + slots % core.n_agents  # (n, A - 1)
+        core, n_pixels = steering.core, depth.shape[-1]
+        others = self._rivals()
         offsets = core.agents.positions.view(-1, 2)[others] - pose.position[:, None]
         away, bearing = offsets.norm(dim=-1), steering.bearings(pose, offsets)
         sideways = torch.tan(torch.deg2rad(bearing)) / math.tan(math.radians(core.fov / 2))
         pixel = (0.5 * n_pixels * (1 - sideways)).clamp(0, n_pixels - 1).long()
-        wall = core.agents.radius + SIGHT * (1 - depth.reshape(len(depth), -1).gather(1, pixel))
+        depth = depth.reshape(len(depth), -1)
+        wall = core.agents.radius + SIGHT * (1 - depth.gather(1, pixel))
         sees = (bearing.abs() < core.fov / 2) & (away < SIGHT) & (wall > away - BEHIND)
+        sees &= depth.any(1, True)  # it is not blind
         nearest = torch.where(sees, away, away + 1e3).argmin(1, True)
         return steering.pose(others.gather(1, nearest)[:, 0]), sees.any(1)
+
+    def _rivals(self) -> torch.Tensor:
+        """Returns the lanes (n, R) of the agents of other teams, for each of its own."""
+        lanes, n_agents = self.steering.lanes[:, None], self.steering.core.n_agents
+        return lanes - lanes % n_agents + self.rivals[self.steering.lanes % n_agents]
+
+
+class Runner(Hunter):
+    """Plays both sides of hide and seek: a hider runs, a seeker is a `Hunter`.
+
+    A hider that a straight way leads to from a seeker runs to a landmark that no way leads straight
+    to, preferring those that it reaches before any seeker. There it stays. It knows the poses of
+    all seekers; bodies are in its way as in anybody's.
+    """
+
+    def __init__(self, env: Any):
+        super().__init__(env)
+        if not hasattr(env, "is_hider"):
+            raise ValueError(f"env.is_hider says who runs, and {type(env).__name__} has none")
+        self.is_hider = env.is_hider
+
+    def _act(self, world, state, pose, near, generator) -> tuple[arrdict, arrdict]:
+        steering, plans = self.steering, self.steering.plans
+        hunting, hunts = super()._act(world, state, pose, near, generator)
+        goals, own = plans.targets[pose.plan], steering.lengths(near)
+        theirs, watched, found = torch.full_like(own, torch.inf), False, False
+        for rivals in self._rivals().unbind(1):
+            other = steering.pose(rivals)
+            theirs = theirs.minimum(steering.lengths(steering.near(other)))
+            ends = torch.cat([goals, pose.position[:, None]], 1)
+            is_clear = plans.straight(pose.plan, other.position, ends) < BLOCKED
+            watched, found = watched | is_clear[:, :-1], found | is_clear[:, -1]
+        target, patience = state["target"][:, None], state["patience"] - 1
+        lead = (theirs - own).clamp(-UNSEEN, UNSEEN / 4) - COST * own
+        value = torch.where(own.isfinite(), lead - UNSEEN * watched, -torch.inf)
+        is_late = (patience <= 0)[:, None]  # something is in the way
+        best = value.scatter(1, target, value.gather(1, target) - 1e3 * is_late).argmax(1)
+        is_over = world["reset"] | (found & watched.gather(1, target)[:, 0]) | is_late[:, 0]
+        goal = goals.gather(1, target[..., None].expand(-1, 1, 2))[:, 0]
+        has_arrived = (goal - pose.position).norm(dim=-1) < ARRIVED
+        best = torch.where(is_over, best, target[:, 0])
+        steps = (PATIENCE + PER_METRE * own.gather(1, best[:, None])[:, 0].clamp(max=1e3)).long()
+        runs = arrdict(
+            state, target=best, patience=torch.where(is_over | has_arrived, steps, patience)
+        )
+        aim = torch.where(has_arrived[:, None], pose.position, steering.aim(pose, near, best))
+        running = steering.decide(pose, aim, aim, turning=0.0)
+        is_hider = self.is_hider[steering.lanes % steering.core.n_agents]
+
+        def chosen(a, b) -> torch.Tensor:
+            return torch.where(is_hider.view(-1, *[1] * (a.ndim - 1)), a, b)
+
+        actions = chosen(running["actions"], hunting["actions"])
+        return arrdict(actions=actions), arrdict(
+            {key: chosen(runs[key], hunts[key]) for key in hunts}
+        )
