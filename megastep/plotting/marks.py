@@ -142,7 +142,7 @@ def plot_object(
 ) -> None:
     """Draws a disc, a crate, a ramp or a door, as :class:`megastep.engine.Objects` has them; the
     colour is (3,), sRGB. The width of a crate or ramp is a fraction of its length. A ramp has
-    arrows towards its high side. ``edge``: the colour of a bold outline, such as that of the team that locked it.
+    arrows towards its high side. ``edge``: colour of a bold outline, as of the team that locked it.
     """
     area, position = Area.on(ax), np.asarray(position, float)
     fill, line = tuple(np.asarray(colour, float)), 0.7 if edge is None else 2.8
@@ -159,7 +159,7 @@ def plot_object(
         aside = width * aside
         corners = position + np.array([aside - ahead, ahead + aside, ahead - aside, -ahead - aside])
         area.polygon(corners, OBJECTS, fill=fill, alpha=0.5)
-        area.line(corners, OBJECTS, colour=edge, width=2 * line)
+        area.line(corners, OBJECTS, colour=edge, width=max(line, 1.4))
         for step in (-0.3, 0.1, 0.5):
             tip = position + step * ahead
             arrow = [tip - 0.4 * ahead + 0.5 * aside, tip, tip - 0.4 * ahead - 0.5 * aside]

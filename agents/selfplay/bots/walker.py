@@ -207,7 +207,8 @@ class Runner(Hunter):
         steering, plans = self.steering, self.steering.plans
         hunting, hunts = super()._act(world, state, pose, near, generator)
         goals, own = plans.targets[pose.plan], steering.lengths(near)
-        theirs, watched, found = torch.full_like(own, torch.inf), False, False
+        theirs, watched = torch.full_like(own, torch.inf), torch.zeros_like(own, dtype=torch.bool)
+        found = torch.zeros_like(world["reset"])
         for rivals in self._rivals().unbind(1):
             other = steering.pose(rivals)
             theirs = theirs.minimum(steering.lengths(steering.near(other)))
