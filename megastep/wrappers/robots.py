@@ -114,13 +114,16 @@ class OdometryDrift(Wrapper):
         length = (moved * moved).sum(-1).sqrt()
         veered = scale[:, 2] * length * (180 / math.pi) + scale[:, 1] * turned
         degrees = self.error[:, 2] + veered
-        believed = _turned(moved, headings(degrees)) * (1 + scale[:, :1])
+        begins = world.reset
+        angles = torch.stack([degrees, -angle, -degrees.masked_fill(begins, 0)])
+        believing, back, correcting = headings(angles)
+        believed = _turned(moved, believing) * (1 + scale[:, :1])
         error = torch.cat([self.error[:, :2] + (believed - moved), degrees[:, None]], 1)
-        self.error.copy_(error.masked_fill(world.reset[:, None], 0))
+        self.error.copy_(error.masked_fill(begins[:, None], 0))
         self.pose.copy_(torch.cat([position, angle[:, None]], 1))
         goal = world.obs.goal[:, 0].float()
-        offset = _turned(self.error[:, :2], headings(-angle))
-        seen = _turned(goal[:, :1] * 10 * goal[:, 1:] - offset, headings(-self.error[:, 2]))
+        offset = _turned(self.error[:, :2], back)
+        seen = _turned(goal[:, :1] * 10 * goal[:, 1:] - offset, correcting)
         metres = (seen * seen).sum(-1, keepdim=True).sqrt()
         seen = torch.cat([metres * 0.1, seen / metres.clamp(min=1e-6)], 1)
         obs = arrdict(world.obs, goal=seen[:, None].to(world.obs.goal.dtype))
