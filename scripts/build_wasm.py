@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from megastep.agents.networks.web import LIBRARY as POLICY
 from megastep.envs.deathmatch.bot import LIBRARY as DEATHMATCH
 from megastep.envs.explorer import LIBRARY as EXPLORER
+from megastep.envs.hideandseek import LIBRARY as HIDEANDSEEK
 from megastep.envs.keys import LIBRARY as KEYS
 from megastep.envs.memory import LIBRARY as MEMORY
 from megastep.envs.minatar import LIBRARY as MINATAR
@@ -22,7 +23,8 @@ from megastep.kernels.build import compile
 from megastep.kernels.build.launch import ENGINE
 from megastep.web.page import SHIPPED
 
-LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MINATAR, MINIGRID, MEMORY, KEYS, POLICY
+LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MINATAR, MINIGRID, MEMORY, KEYS
+LIBRARIES += HIDEANDSEEK, POLICY
 #: Operations of setting up, of scripted bots and of robots, which no page launches.
 ABSENT = {
     *("bake", "place_objects", "physics_bodies", "uniform", "bot", "scan"),

@@ -95,6 +95,7 @@ def run_all(device):
         (envs.PointGoal(7, homes, **everywhere, cameras=[0, 180]), seven),
         (envs.Memory(7, sample("memory_maze", 2), device=device, privileged=True), seven),
         (envs.Keys(7, sample("homes", 2), device=device, privileged=True), seven),
+        (envs.HideAndSeek(7, prep=3, limit=9, **everywhere), range(9)),
     ]
     for n_agents in (2, 16):
         settings = dict(n_agents=n_agents, damage=1, privileged=True)

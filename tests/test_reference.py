@@ -49,9 +49,11 @@ def test_settings_say_what_applies():
     assert rows["`logging.every`"][2:] == ("100", "4", "updates between two lines of metrics")
 
 
-@pytest.mark.parametrize("name", ["deathmatch", "explorer", "keys", "memory", "pointgoal", "pong"])
+@pytest.mark.parametrize(
+    "name", ["deathmatch", "explorer", "hideandseek", "keys", "memory", "pointgoal", "pong"]
+)
 def test_metrics_of_environments_are_described(name):
-    plans = {} if name in ("keys", "pong") else {"geometries": [toys.box()]}
+    plans = {} if name in ("hideandseek", "keys", "pong") else {"geometries": [toys.box()]}
     world = envs.ENVS[name](2, device="cpu", **plans).reset()
     assert {*world.metrics} == {*docstrings.described(envs.ENVS[name], "Metrics")}
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from megastep.dotdict import dotdict
-from megastep.geometries import databases, mazes, memory_mazes, toys
+from megastep.geometries import databases, mazes, memory_mazes, quadrants, toys
 from megastep.geometries import files as npz
 from megastep.geometries.homes import plan
 from megastep.geometry import mirror_image
@@ -22,7 +22,7 @@ from megastep.settings import checked, closest
 
 __all__ = [
     *("bench", "box", "column", "cubicasa", "files", "homes", "houseexpo", "maze", "memory_maze"),
-    *("mixed", "suite"),
+    *("mixed", "quadrant", "suite"),
 ]
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
@@ -184,6 +184,25 @@ def memory_maze(
         cell: side of a cell, in metres.
     """
     return _generated(memory_mazes, n, split, seed, size=size, cell=cell)
+
+
+@checked
+def quadrant(
+    n: Count = 512,
+    split: str = "training",
+    seed: Seed = 1,
+    width: Annotated[float, Field(ge=4, le=100)] = 6.0,
+    opening: Annotated[float, Field(ge=0.32, le=1)] = 0.45,
+) -> list[dotdict]:
+    """Returns square rooms with an inner room in a corner, as in OpenAI's hide and seek, from 5,000
+    of them, which differ in the inner room's one or two openings.
+
+    Args:
+        n, split, seed: how many are drawn, from which split, in which order.
+        width: width of the outer room, in metres. The inner room has half of it.
+        opening: width of the openings, in metres.
+    """
+    return _generated(quadrants, n, split, seed, width=width, opening=opening)
 
 
 @checked

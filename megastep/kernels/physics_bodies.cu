@@ -1,6 +1,6 @@
 // One warp per environment: a thread per slot, candidate and touch.
 #include "physics_bodies.h"
-#include "warp_cuda.h"
+#include "common/warp_cuda.h"
 
 KERNEL physics_bodies(PhysicsBodiesParams p) {
     wait_for_previous();

@@ -1,7 +1,7 @@
 // One thread per environment; where points are to be hidden one warp, each lane of which tests one
 // wall at a time.
 #include "spawn.h"
-#include "warp_cuda.h"
+#include "common/warp_cuda.h"
 
 template <int hidden, int with_objects>
 DEVICE void spawn_in(const SpawnParams& p) {

@@ -12,6 +12,7 @@ from megastep.engine import checks
 ENDLESS = 2**31 - 1  # steps; the largest int32, which ages and limits are
 #: What draws by seeds derived from that of an environment.
 STREAMS = "spawns", "lifespans", "pointgoal", "ages", "points", "objects", "memory", "keys"
+STREAMS += ("hideandseek",)
 
 
 def derived_seed(seed: int, stream: str) -> int:

@@ -21,12 +21,13 @@ VALUES = 2**31 - 1, -(2**31), -1
 SEEING = dict(res=8, subsample=2, resample=True, privileged=True)
 ENVS = dict.fromkeys(("explorer", "pointgoal", "memory", "keys"), SEEING) | dict(
     deathmatch=dict(**SEEING, n_agents=3, hearing=5.0, search_reward=1.0, aim_reward=1.0),
+    hideandseek=dict(**SEEING, variant="homes", prep=0),
     minimal={},
     pong=dict(pixels=True, self_play=True),
     minatar=dict(id="seaquest"),
 )
 #: Floats whose memory holds integers too.
-RECORDS = ".all.records", ".runs.runs"
+RECORDS = ".all.records", ".all.bodies", ".runs.runs"
 
 
 def indices(env):

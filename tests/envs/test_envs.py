@@ -45,6 +45,10 @@ SHORT = {
         hearing=5,
         privileged=True,
     ),
+    "hideandseek": dict(limit=20, res=2, subsample=1),
+    "hideandseek, privileged": dict(
+        limit=20, prep=5, n_hiders=3, n_boxes=3, res=2, subsample=1, privileged=True, resample=True
+    ),
     "pointgoal": dict(limit=15, res=1, subsample=1),
     "pointgoal, cameras": dict(limit=15, res=1, subsample=1, cameras=(0, 180)),
     "pointgoal, privileged": dict(limit=15, res=1, subsample=1, privileged=True),
@@ -75,6 +79,7 @@ MOST = chosen(
     (
         *("minimal", "explorer, privileged", "explorer, continuous", "explorer, cameras"),
         *("memory, privileged", "keys, privileged", "deathmatch, privileged"),
+        "hideandseek, privileged",
         *("pointgoal, continuous", "pong, pixels of both", "minatar"),
     )
 )
@@ -83,7 +88,8 @@ MOST = chosen(
 def make(name, device="cpu", n_envs=12, seed=1, **settings):
     cls = envs.ENVS[name.split(",")[0]]
     if "geometries" in inspect.signature(cls).parameters:
-        settings["geometries"] = sample("homes" if name.startswith("keys") else "bench", 4)
+        source = {"keys": "homes", "hideandseek": "quadrant"}.get(name.split(",")[0], "bench")
+        settings["geometries"] = sample(source, 4)
     return cls(n_envs, seed=seed, device=device, **{**SHORT[name], **settings})
 
 

@@ -17,6 +17,7 @@ from tests.helpers.synchronisation import no_synchronisation
 
 N = 7  # as many as rows of PointGoal's progress, whose lanes are on its last axis
 HOMES = geometries.sample("homes", N, seed=7)
+ROOMS = geometries.sample("quadrant", N, seed=7)
 MAZES = geometries.sample("memory_maze", N, seed=7)
 SHORT = dict(resample=True, privileged=True, limit=9)
 MAKERS = {
@@ -33,6 +34,7 @@ MAKERS = {
     "minatar": (envs.MinAtar, dict(id="seaquest", limit=9)),
     "memory": (envs.Memory, dict(geometries=MAZES, **SHORT)),
     "keys": (envs.Keys, dict(geometries=HOMES, **SHORT)),
+    "hideandseek": (envs.HideAndSeek, dict(geometries=ROOMS, prep=3, **SHORT)),
     "forage": (Forage, dict(geometries=HOMES, limit=9)),
 }
 every_env = pytest.mark.parametrize("name", MAKERS)

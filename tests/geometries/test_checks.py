@@ -11,6 +11,7 @@ from megastep.geometries import checks, files
 KINDS = (
     *(("homes", {}), ("homes", {"density": 3.0}), ("homes", {"outer": False})),
     *(("bench", {}), ("maze", {"size": 5}), ("memory_maze", {}), ("box", {}), ("column", {})),
+    ("quadrant", {}),
 )
 
 

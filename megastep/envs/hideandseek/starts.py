@@ -1,0 +1,80 @@
+"""Starts of hide and seek: where agents and bodies are when an episode begins.
+
+D layouts, M starts per layout, A agents and K bodies per environment.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from megastep import cache, geometry
+from megastep.dotdict import dotdict
+from megastep.modules.spawning import CLEARANCE, candidates, distances, per_geometry
+
+N_POINTS = 512  # drawn per layout
+ROUNDS = 50  # of drawing a start; then the search ends
+PREFIX, MAX_FILES = "hideandseek-", 16  # of the files in the cache, 3 MB each for 500 layouts
+MIN_CACHED = 32  # layouts
+ANYWHERE, OUTER, INNER = range(3)  # where something may be put
+
+
+def cached_starts(
+    geometries: Sequence[dotdict], n: int, radii: Sequence[float], rooms: Sequence[int], seed: int
+) -> np.ndarray:
+    """Returns :func:`starts`. Keeps those of many layouts in the cache."""
+    arguments = n, tuple(radii), tuple(rooms), seed
+    if len(geometries) < MIN_CACHED:
+        return starts(geometries, *arguments)
+    parts = Path(__file__), arguments, *geometry.contents(geometries)
+    build = lambda: dict(starts=starts(geometries, *arguments))  # noqa: E731
+    return cache.arrays(PREFIX, parts, build, MAX_FILES)["starts"]
+
+
+def starts(
+    geometries: Sequence[dotdict], n: int, radii: Sequence[float], rooms: Sequence[int], seed: int
+) -> np.ndarray:
+    """Returns n random starts of each geometry, (D, n, A + K, 2) float32 metres: points such that
+    discs of these radii are 5 cm clear of each other and of every wall, each in its room: ANYWHERE,
+    OUTER or INNER. ValueError if a geometry lacks a room, or has no space.
+    """
+    found = per_geometry(geometries, seed, lambda g, random: _starts(g, n, radii, rooms, random))
+    return np.stack(found).astype(np.float32)
+
+
+def _starts(g, n, radii, rooms, random) -> np.ndarray:
+    if INNER in rooms and "inner" not in g:
+        raise ValueError(
+            f"geometry {g.id} has no inner room, which variant=quadrant needs: use "
+            "geometry=quadrant, or variant=homes"
+        )
+    points = next(candidates(g, N_POINTS, random))
+    from_wall = distances(points, g.walls)
+    room = g.masks[tuple(geometry.indices(points, g.masks.shape, g.res).T)]
+    is_in = np.array([room > 0, room != g.get("inner"), room == g.get("inner")])
+    places = [
+        np.flatnonzero(is_in[room] & (from_wall > radius + CLEARANCE))
+        for radius, room in zip(radii, rooms)
+    ]
+    chosen = [_start(points, places, radii, random) for _ in range(n)]
+    if any(one is None for one in chosen):
+        raise ValueError(
+            f"geometry {g.id} has no room for {len(radii)} agents and objects of up to "
+            f"{2 * max(radii):.2g} m: use fewer, or larger floor plans"
+        )
+    return np.stack(chosen)  # pyright: ignore[reportArgumentType]
+
+
+def _start(points, places, radii, random) -> np.ndarray | None:
+    """Draws a point for each disc, the largest first; None if that failed too often."""
+    for _ in range(ROUNDS):
+        start, near = np.full((len(radii), 2), np.inf), np.asarray(radii) + CLEARANCE
+        for k in np.argsort(radii, kind="stable")[::-1]:
+            apart = np.linalg.norm(points[places[k], None] - start, axis=-1)
+            free = places[k][(apart > near + radii[k]).all(1)]
+            if not len(free):
+                break
+            start[k] = points[free[random.integers(len(free))]]
+        else:
+            return start
+    return None
