@@ -84,11 +84,15 @@ class HideAndSeek(FirstPerson):
 
     Metrics:
         ``hidden``: fraction of the steps after the preparation in which no hider was seen.
-        ``max_box_move_prep``, ``max_box_move``: metres that a box, elongated or not, was moved by
-        the end of the preparation, and by that of the episode, at most.
-        ``num_box_lock_prep``, ``num_box_lock``: boxes locked then.
-        ``max_ramp_move_prep``, ``max_ramp_move``, ``num_ramp_lock_prep``, ``num_ramp_lock``:
-        likewise of ramps.
+        ``max_box_move_prep``: metres that a box, elongated or not, was moved by the end of the
+            preparation, at most.
+        ``max_box_move``: the same by the end of the episode.
+        ``num_box_lock_prep``: boxes that are locked at the end of the preparation.
+        ``num_box_lock``: the same at the end of the episode.
+        ``max_ramp_move_prep``: as of boxes, and so are the next three.
+        ``max_ramp_move``: metres.
+        ``num_ramp_lock_prep``: ramps.
+        ``num_ramp_lock``: ramps.
 
     Args:
         geometries: floor plans. Default: quadrants or homes, by the variant, at most 512.

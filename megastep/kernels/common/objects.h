@@ -63,14 +63,6 @@ HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
 
 HD Body* bodies_of(const ObjectsParams& o) { return (Body*)o.bodies; }
 
-// Half the diagonal of object k, if it is a body, since bodies never overlap; else its size.
-HD float radius_of(const ObjectsParams& o, int k, float size) {
-    if (o.n_bodies == 0 || o.object_bodies[k] < 0 || o.shapes[k] == DISC)
-        return size;
-    float half = LOAD((const Float4*)o.ends + o.line_starts[k]).y;
-    return size * SQRT(1.f + half * half);
-}
-
 // The object of an environment's line l; the first if its number is of none.
 HD int object_of(const ObjectsParams& o, int l) {
     int k = o.line_object[l];
@@ -102,6 +94,14 @@ struct Lines {
 
 HD Lines lines_of(const ObjectsParams& o, int k) {
     return {within(o.line_starts[k], o.n_lines), within(o.line_starts[k + 1], o.n_lines)};
+}
+
+// Half the diagonal of object k, if it is a body, since bodies never overlap; else its size.
+HD float radius_of(const ObjectsParams& o, int k, float size) {
+    if (o.n_bodies == 0 || o.object_bodies[k] < 0 || o.shapes[k] == DISC)
+        return size;
+    float half = LOAD((const Float4*)o.ends + lines_of(o, k).first).y;
+    return size * SQRT(1.f + half * half);
 }
 
 // Line l of an environment's objects, one of this object at a pose.

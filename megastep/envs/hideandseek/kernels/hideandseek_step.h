@@ -77,7 +77,7 @@ HD void start_episode(const HideAndSeekStepParams& p, int env, int layout) {
 HD Float4 nearest_point(const ObjectsParams& o, int k, const Object& object, float x, float y) {
     Pose pose = pose_at(object.x, object.y, object.angle);
     float dx = x - object.x, dy = y - object.y;
-    float half = -object.size * LOAD((const Float4*)o.ends + o.line_starts[k]).y;
+    float half = -object.size * LOAD((const Float4*)o.ends + lines_of(o, k).first).y;
     float along = clamp(pose.cosine * dx + pose.sine * dy, -object.size, object.size);
     float aside = clamp(pose.cosine * dy - pose.sine * dx, -half, half);
     float to_x = pose.cosine * along - pose.sine * aside - dx;
