@@ -101,7 +101,7 @@ HD void begin_agent(const PhysicsBodiesParams& p, Bodies& b, int env, int a) {
 // Fills in the slot of a body, whose object is at rest if it is not to move.
 HD void begin_body(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
     const ObjectsParams& o = p.objects;
-    int slot = p.scenery.n_agents + k, object_index = o.body_objects[k];
+    int slot = p.scenery.n_agents + k, object_index = object_of_body(o, k);
     Object object = objects_of(o)[env * o.n_objects + object_index];
     Body body = bodies_of(o)[env * o.n_bodies + k];
     float hy = half_width_of(o, object_index, object.size);
@@ -201,7 +201,7 @@ HD int elevation_of(const PhysicsBodiesParams& p, const Bodies& b, int env, int 
         up = 0;
     float reach = b.extent[a] + top_speed(b, a, n_agents) * p.seconds;
     for (int k = 0; k < o.n_bodies && up == 0; k++)
-        if (o.shapes[o.body_objects[k]] == RAMP && b.exists[n_agents + k] &&
+        if (o.shapes[object_of_body(o, k)] == RAMP && b.exists[n_agents + k] &&
             drives_up(b, a, n_agents + k, reach))
             up = -1 - k;
     return up < 0 && is_over(b, a, n_agents - 1 - up) ? p.ramp_steps : up;
@@ -696,7 +696,7 @@ HD void end_body(const PhysicsBodiesParams& p, const Bodies& b, int env, int k) 
     body.holder = slips ? -1 : b.holders[slot];
     if (!(b.inv_mass[slot] > 0.f))
         return;
-    Object& object = objects_of(o)[env * o.n_objects + o.body_objects[k]];
+    Object& object = objects_of(o)[env * o.n_objects + object_of_body(o, k)];
     object.x = b.hulls[slot].x;
     object.y = b.hulls[slot].y;
     if (b.angles[slot] != object.angle)

@@ -65,7 +65,7 @@ HD void place_objects_of(const PlaceObjectsParams& p, int env) {
         object.angle = 360.f * unit_float(bits.b) - 180.f;
         object.carrier = -1;
         object.visible = 1;
-        int body = o.n_bodies ? o.object_bodies[i % o.n_objects] : -1;
+        int body = o.n_bodies ? mini(o.object_bodies[i % o.n_objects], o.n_bodies - 1) : -1;
         if (body >= 0)
             rest(bodies_of(o)[env * o.n_bodies + body]);
     }

@@ -41,7 +41,7 @@ REACH = 0.25  # metres from an agent's centre to what it grabs or locks, as in t
 #: Bodies: an agent of 1 kg pushes with 20 N.
 BOX = dict(side=0.6, mass=1.0, friction=0.4)
 LONG = dict(side=1.2, width=0.2, mass=1.0, friction=0.4)
-RAMP = dict(side=0.6, width=0.5, mass=1.0, friction=0.4)
+RAMP = dict(side=0.6, width=0.4, mass=1.0, friction=0.4)
 #: Of boxes, elongated ones and ramps; then of what hiders and seekers have locked.
 COLOURS = "yellow", "orange", "green", "cyan", "red"
 TEAMS = "blue", "magenta"  # colours of hiders and seekers
@@ -54,9 +54,9 @@ class HideAndSeek(FirstPerson):
     """Hiders have some time to lock themselves in, or to lock away what others need; then seekers
     look for them.
 
-    Boxes, elongated boxes and ramps are pushed by walking into them, and grabbed and locked. In the
-    preparation, seekers are blind and cannot act. What a team locked, nobody moves until the team
-    unlocks it.
+    Boxes, elongated boxes and ramps are pushed by walking into them, and grabbed and locked. An
+    agent that drives up a ramp passes over boxes for 20 steps. In the preparation, seekers are
+    blind and cannot act. What a team locked, nobody moves until the team unlocks it.
 
     Observation:
         A dict of float16, W = ``res / subsample`` pixels (64).
@@ -64,10 +64,10 @@ class HideAndSeek(FirstPerson):
         - ``rgb``, ``d`` and ``imu`` of :class:`~megastep.envs.first_person.FirstPerson`. Hiders are
           blue, seekers magenta, with a red front. Boxes are yellow, elongated ones orange, ramps
           green; what hiders have locked is cyan, and what seekers have red.
-        - ``state``: (B, 1, 8): 1 for a hider; 1 in the preparation; the fraction of the phase that
-          is left; 1 if the agent holds something. Then of what it holds, or would grab or lock: 1
-          if there is such a thing, if its own team locked it, if the other team did, if another
-          agent holds it.
+        - ``state``: (B, 1, 9): 1 for a hider; 1 in the preparation; the fraction of the phase that
+          is left; 1 if the agent has driven up a ramp; 1 if it holds something. Then of what it
+          holds, or would grab or lock: 1 if there is such a thing, if its own team locked it, if
+          the other team did, if another agent holds it.
 
     Actions:
         (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right,
@@ -102,10 +102,11 @@ class HideAndSeek(FirstPerson):
         n_seekers: agents that seek.
         n_boxes: boxes, 60 cm wide.
         n_long: elongated boxes, 120 x 20 cm.
-        n_ramps: ramps, 60 x 50 cm. With boxes, at most 16.
+        n_ramps: ramps, 60 x 40 cm. With boxes, at most 16.
         limit: steps of an episode.
         prep: steps of its preparation. Default: a third in the quadrant, two fifths in homes.
         movable: if False, nothing moves the boxes and ramps.
+        grab_elevated: agents that have driven up a ramp may grab, and so ride on boxes.
         resample: if True, each episode takes place in a randomly drawn floor plan. Otherwise an
             environment keeps its own.
         privileged: worlds hold ``privileged`` for a critic: of every agent and body the pose, who
@@ -133,6 +134,7 @@ class HideAndSeek(FirstPerson):
         limit: Annotated[int, Field(ge=2, le=10**6)] = 240,
         prep: Annotated[int, Field(ge=0, le=10**6)] | None = None,
         movable: bool = True,
+        grab_elevated: bool = False,
         seed: int = 1,
         device: torch.device | str | None = None,
         res: Annotated[int, Field(ge=1, le=1024)] = 256,
@@ -152,8 +154,9 @@ class HideAndSeek(FirstPerson):
         kinds = {
             "box": modules.Crate(n_boxes, movable=True, **BOX),
             "long": modules.Crate(n_long, movable=True, **LONG),
-            "ramp": modules.Crate(n_ramps, movable=True, **RAMP),
+            "ramp": modules.Ramp(n_ramps, **RAMP),
         }
+        self._grab_elevated = grab_elevated
         self._kinds = {name: kind for name, kind in kinds.items() if kind.count}
         lens: dict = dict(res=res, subsample=subsample, fov=fov, fps=fps)
         super().__init__(n_envs, geometries, seed=seed, device=device, resample=resample, **lens)
@@ -175,6 +178,7 @@ class HideAndSeek(FirstPerson):
             prep=prep,
             view_cosine=math.cos(math.radians(fov / 2)),
             reach=REACH,
+            grab_elevated=int(grab_elevated),
         )
         self.n_draws = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
         self.placed = torch.zeros((n_envs, n_bodies, 2), device=self.device)
@@ -185,7 +189,8 @@ class HideAndSeek(FirstPerson):
     def _furnish(self, geometries, resample) -> modules.RandomSpawns:
         core, n_seekers = self.core, self.n_agents - self.n_hiders
         self.seed = derived_seed(core.seed, "hideandseek")
-        self.objects = modules.Objects(geometries, core, self._kinds, COLOURS, n_points=1)
+        options: dict = dict(n_points=1, grab_elevated=self._grab_elevated)
+        self.objects = modules.Objects(geometries, core, self._kinds, COLOURS, **options)
         layouts, teams = core.scenery.layouts, linear([modules.COLOURS[team] for team in TEAMS])
         textures = layouts.agent_textures.view(len(layouts), self.n_agents, -1, 3)
         is_front = (textures == torch.tensor(FRONT_COLOUR).to(textures)).all(-1, keepdim=True)

@@ -63,6 +63,11 @@ HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
 
 HD Body* bodies_of(const ObjectsParams& o) { return (Body*)o.bodies; }
 
+// The object that an environment's body k is.
+HD int object_of_body(const ObjectsParams& o, int k) {
+    return within(o.body_objects[k], o.n_objects - 1);
+}
+
 // The object of an environment's line l; the first if its number is of none.
 HD int object_of(const ObjectsParams& o, int l) {
     int k = o.line_object[l];

@@ -32,6 +32,7 @@ struct HideAndSeekStepParams : GameParams {
     int prep;           // steps of the preparation
     float view_cosine;  // of half the field of view
     float reach;        // metres from an agent's centre to a body that it grabs or locks
+    int grab_elevated;  // 1: elevated agents may grab
 };
 
 HD Object* things_of(const HideAndSeekStepParams& p, int env) {
@@ -123,15 +124,21 @@ HD int target_of(const HideAndSeekStepParams& p, const Walls& walls, int env, in
     return target;
 }
 
+// Returns 1 if agent i has driven up a ramp.
+HD int is_elevated(const HideAndSeekStepParams& p, int i) {
+    return p.objects.elevated && p.objects.elevated[i] > 0;
+}
+
 // Has agent a grab, let go, lock or unlock.
 HD void use_hand(const HideAndSeekStepParams& p, const Walls& walls, int env, int a, int locks) {
     int target = target_of(p, walls, env, a), team = a >= p.n_hiders;
     if (target < 0)
         return;
     Body& body = bodies_in(p, env)[target];
+    int may_grab = p.grab_elevated || !is_elevated(p, env * p.scenery.n_agents + a);
     if (!locks && body.holder == a) {
         body.holder = -1;
-    } else if (!locks && body.holder < 0 && !body.locked) {
+    } else if (!locks && may_grab && body.holder < 0 && !body.locked) {
         body.holder = a;
         body.grabbed = 1;
     } else if (locks && !body.locked) {
@@ -186,8 +193,8 @@ HD void measure_all(const HideAndSeekStepParams& p, int env, float* out) {
 }
 
 // What agent a knows: its team, the preparation, the fraction of the phase that is left; whether it
-// holds a body; of the body that it would grab or lock, whether there is one, it is locked by its
-// own team or the other one, or another agent holds it.
+// is elevated, holds a body; of the body that it would grab or lock, whether there is one, it is
+// locked by its own team or the other one, or another agent holds it.
 HD void write_state(const HideAndSeekStepParams& p, const Walls& walls, int env, int a, int age) {
     int target = target_of(p, walls, env, a), team = a >= p.n_hiders, is_prep = age < p.prep;
     int left = (is_prep ? p.prep : p.limit) - age, of = is_prep ? p.prep : p.limit - p.prep;
@@ -198,6 +205,7 @@ HD void write_state(const HideAndSeekStepParams& p, const Walls& walls, int env,
     float values[STATE] = {(float)!team,
                            (float)is_prep,
                            (float)left / (float)of,
+                           (float)is_elevated(p, env * p.scenery.n_agents + a),
                            (float)holds,
                            (float)is_there,
                            (float)(is_there && body.locked && body.owner == team),
