@@ -24,7 +24,7 @@ ENVS = {
     "minigrid": (envs.MiniGrid, dict(n_envs=2, id="MiniGrid-KeyCorridorS3R1-v0")),
     "memory": (envs.Memory, dict(n_envs=1, limit=30, resample=True)),
     "keys": (envs.Keys, dict(n_envs=1, limit=30, resample=True)),
-    "hideandseek": (envs.HideAndSeek, dict(n_envs=1, limit=30, resample=True)),
+    "hideandseek": (envs.HideAndSeek, dict(n_envs=1, limit=30, variant="homes", resample=True)),
 }
 
 
