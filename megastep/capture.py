@@ -8,10 +8,11 @@ does not advance an environment. :class:`Captured` captures the ``step`` of an e
 
 import collections
 import contextlib
+import gc
 import re
 import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -135,6 +136,22 @@ def _renew_generators(roots) -> None:
                 rebind(parent, step, renewed.setdefault(id(old), torch.Generator(old.device)))
 
 
+@contextlib.contextmanager
+def recording(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream) -> Iterator[None]:
+    """``torch.cuda.graph`` without garbage collection: freeing another graph ends a recording.
+
+    Other threads, such as NCCL's, may query events meanwhile.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+            yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
 def end_failed_recording() -> None:
     """Makes PyTorch's default generator of the current GPU usable again after a recording failed,
     which leaves it marked as being captured, so that drawing from it raises. The next recording
@@ -142,8 +159,7 @@ def end_failed_recording() -> None:
     """
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
     with contextlib.suppress(RuntimeError):  # the error of the failed recording is the one to raise
-        # threads of NCCL may query events meanwhile
-        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+        with recording(graph, stream):
             torch.zeros((), device="cuda")  # PyTorch warns about empty graphs
 
 
@@ -207,7 +223,7 @@ class Graph:
         torch.cuda.current_stream().wait_stream(side)
         restore(roots, saved)
         before = _StateBefore(roots.values())
-        with torch.cuda.graph(self._graph, stream=side):
+        with recording(self._graph, side):
             self._out = before.keep_in_place(function(*inputs))
 
     def __call__(self, *args) -> Any:

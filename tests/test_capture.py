@@ -276,6 +276,26 @@ def test_on_the_cpu_steps_are_not_captured():
 @pytest.mark.cuda
 @pytest.mark.skipif(not GPU, reason="needs a GPU")
 class TestOnTheGPU:
+    def test_no_graph_is_freed_while_another_is_recorded(self):
+        old = [capture.capture(lambda x: x + 1, (torch.ones(3, device="cuda"),), ())]
+        old.append(old)  # a circle, which only garbage collection frees
+        graph, holders = weakref.ref(old[0]), [old]
+        thresholds = gc.get_threshold()
+
+        def function(x):
+            holders.clear()
+            return x + len([[] for _ in range(100)])
+
+        del old
+        gc.set_threshold(1, 1, 1)
+        try:
+            new = capture.Graph(function, (torch.ones(3, device="cuda"),), (), warmup=0)
+        finally:
+            gc.set_threshold(*thresholds)
+        assert new(torch.zeros(3, device="cuda")).tolist() == [100] * 3
+        gc.collect()
+        assert graph() is None
+
     @pytest.mark.parametrize("how", ["in place", "rebound"])
     def test_replays_are_steps(self, how):
         eager, env = Counter(how, "cuda"), capture.Captured(Counter(how, "cuda"))

@@ -7,7 +7,7 @@ import torch
 from megastep.agents.distributed import process_group
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.types import RolloutLike
-from megastep.capture import end_failed_recording
+from megastep.capture import end_failed_recording, recording
 
 # Updates that run eagerly before the capture, since libraries initialise themselves in the first.
 # They train the policy like any other update.
@@ -66,8 +66,7 @@ class CudaGraphUpdate:
         for generator in self.generators:
             graph.register_generator_state(generator.on(self.device))
         try:
-            # thread_local, since NCCL's threads may query events meanwhile
-            with torch.cuda.graph(graph, stream=self.stream, capture_error_mode="thread_local"):
+            with recording(graph, self.stream):
                 metrics = self.update(rollout)
                 self._names = [*metrics]
                 if metrics:  # in one tensor, of which a single kernel makes a copy

@@ -59,7 +59,7 @@ def _address(tensor):
 
 
 @contextlib.contextmanager
-def _record(graph, stream=None):
+def _record(graph, stream=None, capture_error_mode="global"):
     GraphOnCpu.is_recording = True
     try:
         with _Recorder(graph.operations):
