@@ -5,6 +5,7 @@ numbers.
 """
 
 import copy
+import functools
 import operator
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -53,29 +54,20 @@ def _combine(op: Callable, tree: dict, other) -> Any:
     return _map(lambda leaf: op(leaf, other), tree)
 
 
-def _binary(op: Callable) -> Callable:
-    return lambda self, other: _combine(op, self, other)
-
-
-def _unary(op: Callable) -> Callable:
-    return lambda self: _map(op, self)
-
-
-def _define_operators() -> None:
-    """Gives arrdict the operators of arithmetic, comparison and sign."""
-    names = "add sub mul matmul truediv floordiv mod pow lshift rshift and or xor".split()
-    arithmetic = {name: getattr(operator, f"__{name}__") for name in names}
-    for name, op in {**arithmetic, "divmod": divmod}.items():
-        setattr(arrdict, f"__{name}__", _binary(op))
-        setattr(arrdict, f"__r{name}__", _binary(lambda leaf, value, op=op: op(value, leaf)))
-    arrdict.__ior__ = _binary(operator.or_)  # dict has |=, which merges keys, and no other
-    for name in ("lt", "le", "eq", "ne", "ge", "gt"):
-        setattr(arrdict, f"__{name}__", _binary(getattr(operator, name)))
-    for name in ("neg", "pos", "abs", "invert"):
-        setattr(arrdict, f"__{name}__", _unary(getattr(operator, name)))
-
-
-_define_operators()
+_UNARY = "neg", "pos", "abs", "invert"
+_COMPARISONS = "lt", "le", "eq", "ne", "ge", "gt"
+_ARITHMETIC = "add sub mul matmul truediv floordiv mod pow lshift rshift and or xor divmod".split()
+for _name in (*_ARITHMETIC, *_COMPARISONS, *_UNARY):
+    _op = divmod if _name == "divmod" else getattr(operator, f"__{_name}__")
+    if _name in _UNARY:
+        setattr(arrdict, f"__{_name}__", lambda self, *, op=_op: _map(op, self))
+        continue
+    setattr(arrdict, f"__{_name}__", lambda self, other, *, op=_op: _combine(op, self, other))
+    if _name in _ARITHMETIC:
+        _op = functools.partial(lambda op, leaf, value: op(value, leaf), _op)
+        setattr(arrdict, f"__r{_name}__", lambda self, other, *, op=_op: _combine(op, self, other))
+# dict has |=, which merges keys, and no other
+arrdict.__ior__ = lambda self, other: _combine(operator.or_, self, other)
 
 
 def stack(trees: Iterable, dim: int = 0) -> Any:

@@ -88,9 +88,9 @@ class Ranks(NamedTuple):
         tensors |= {f"extra.{i}": tensor for i, tensor in enumerate(extra)}
         rows = all_gather(checksums(tensors.values())).T.tolist()
         for name, sums in zip(tensors, rows, strict=True):
-            if different := [rank for rank, value in enumerate(sums) if value != sums[0]]:
+            if different := ", ".join(str(n) for n, one in enumerate(sums) if one != sums[0]):
                 raise DriftError(
-                    f"The ranks drift apart: policy.{name} differs on {ranks_named(different)}; "
+                    f"The ranks drift apart: policy.{name} differs on rank {different}; "
                     "start all with the same options and packages; a learner of your own averages "
                     "gradients with megastep.agents.distributed.pooling.average_gradients"
                 )
@@ -114,9 +114,3 @@ def checksums(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
     with torch.no_grad():
         bits = [tensor.detach().view(INTEGERS[tensor.element_size()]) for tensor in tensors]
         return torch.stack([part.sum(dtype=torch.int64) for part in bits])
-
-
-def ranks_named(ranks: Sequence[int]) -> str:
-    """Returns `rank 1` or `ranks 1, 2 and 5`."""
-    *others, last = map(str, ranks)
-    return f"ranks {', '.join(others)} and {last}" if others else f"rank {last}"

@@ -1,7 +1,6 @@
 """Settings that contradict each other, or name what is not there: (dotted key, sentence) each."""
 
 import operator
-import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -111,12 +110,6 @@ def _population_conflicts(cfg: "Train") -> Iterator[tuple[str, str]]:
         if problem := _problem_of_variation(cfg, key, one):
             yield "population.vary", f"{key} {problem}"
             break
-    if chosen.schedule is not None and is_many:
-        text = "is of a single agent, and cannot be combined with population.size"
-        yield "population.schedule", text
-    elif chosen.schedule is not None and not os.path.isfile(chosen.schedule):
-        text = f"there is no file {chosen.schedule!r}; give RUN/population.jsonl"
-        yield "population.schedule", text
     if not is_many:
         if chosen.vary:
             text = "is 1, and population.vary needs several members: population.size=8"

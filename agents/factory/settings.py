@@ -201,7 +201,6 @@ class Population:
     every: Samples = 20_000_000
     vary: dict[str, Variation] = dataclasses.field(default_factory=dict)
     score: str = "running"
-    schedule: str | None = None
     member: int | None = None
 
 

@@ -21,7 +21,6 @@ from megastep.agents.runs import (
     agent_file,
     checkpoint,
     folders,
-    populations,
     provenance,
     restore,
 )
@@ -121,8 +120,6 @@ def make_trainer(
             callbacks=[*observers, *(import_object(name)() for name in cfg.callbacks)],
             ranks=ranks,
         )
-        if cfg.population.schedule:
-            trainer.tuning.follow(populations.schedule(Path(cfg.population.schedule)))
         if cfg.curriculum.name != "none":
             parts: dict = dict(env=trainer.env, learner=learner, rollout=trainer.rollout)
             sources = factory.sources_of(homes)

@@ -51,12 +51,9 @@ def best(root: Path) -> int | None:
     ranked_by, path = RUNNING, folder_of(root, 0) / "config.yaml"
     with contextlib.suppress(KeyError, TypeError):
         ranked_by = typed_json.read_yaml(path)["population"]["score"] if path.exists() else RUNNING
-    return _highest([score_of(folder, ranked_by) for folder in members(root)])
-
-
-def _highest(scores_of) -> int | None:
-    values = [-1e400 if score is None else score for score in scores_of]
-    return None if all(score is None for score in scores_of) else values.index(max(values))
+    found = [score_of(folder, ranked_by) for folder in members(root)]
+    known = [score for score in found if score is not None]
+    return found.index(max(known)) if known else None
 
 
 def member(root: Path, which: "int | str" = "best") -> Path:
@@ -144,20 +141,3 @@ def lineage(generations: "list[list[Row]]", member: int) -> list[int]:
     for rows in reversed(generations[1:]):
         line.append(rows[line[-1]]["from"])
     return line[::-1]
-
-
-def schedule(path: Path) -> list[tuple[int, dict[str, float]]]:
-    """Returns the settings of the best member and its ancestors over time: (samples, settings).
-    Raises as `read`.
-    """
-    generations = read(path)
-    if not generations:
-        raise UserError(f"{path} has no generation; give the {FILE} of a population")
-    last = generations[-1]
-    # who copies at the last generation is judged by the one that it copies
-    number = _highest([last[row["from"]].get("score") for row in last])
-    if number is None:
-        raise UserError(f"{path} names no best member, as none had a score in its last generation")
-    line = lineage(generations, number)
-    rows = [rows[n] for rows, n in zip(generations, line)]
-    return [(row["samples"], settings_of(row)) for row in rows]

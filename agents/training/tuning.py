@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from megastep.agents.errors import user_errors
@@ -20,7 +20,6 @@ class Tuning:
 
     def __init__(self, trainer: Trainer):
         self.trainer, self.options = trainer, trainer.learner_options
-        self.timetable: list[tuple[int, Mapping[str, float]]] = []
         self.scheduled: dict[str, float] = {}
         of_learner, of_env = self.options.coefficients, [*optional(trainer.env, "coefficients")]
         self.coefficients = of_env if of_learner is None else [*of_env, of_learner]
@@ -30,12 +29,6 @@ class Tuning:
                 f"{type(trainer.learner).__name__} has no set_lr(lr), so its learning rate cannot "
                 f"fall with {anneal}: use learner.anneal=never, or add the method"
             )
-
-    def follow(self, timetable: Sequence[tuple[int, Mapping[str, float]]]) -> None:
-        """Sets settings later on, (samples, settings) each, in order. ValueError as `set`."""
-        for key in {key for _, values in timetable for key in values}:
-            self._owner(key)
-        self.timetable = [*timetable]
 
     def set(self, values: Mapping[str, float]) -> None:
         """Changes settings from the next update on, without waiting for the device: numbers by key,
@@ -60,8 +53,6 @@ class Tuning:
 
     def on_collect(self, trainer: Trainer) -> None:
         """Sets what has a schedule. Raises UserError if a schedule of the user's fails."""
-        while self.timetable and self.timetable[0][0] <= trainer.samples:
-            self.set(self.timetable.pop(0)[1])
         for one in self.coefficients:
             if one.schedules:
                 with user_errors("", (ValueError,)):

@@ -135,9 +135,18 @@ def length(name: str, value: object, axis: int = 0) -> int:
 
 
 def address(
-    name: str, value: Any, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
+    name: str,
+    value: Any,
+    shape: tuple[int, ...],
+    dtype: torch.dtype,
+    device: torch.device,
+    is_optional: bool = False,
 ) -> int:
-    """Returns the address of a contiguous tensor of that shape, dtype and device, or raises."""
+    """Returns the address of a contiguous tensor of that shape, dtype and device, or raises; a null
+    pointer for None, if it ``is_optional``.
+    """
+    if value is None and is_optional:
+        return 0
     try:
         fits = (
             value.dtype is dtype
@@ -151,13 +160,6 @@ def address(
         wanted = f"a contiguous {dtype} tensor of shape {tuple(shape)} on {device}"
         _refuse_tensor(name, wanted, value)
     return value.data_ptr()
-
-
-def optional(
-    name: str, value: Any, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
-) -> int:
-    """Returns a tensor's :func:`address`, or 0 for None: a null pointer."""
-    return 0 if value is None else address(name, value, shape, dtype, device)
 
 
 def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:

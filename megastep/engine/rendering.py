@@ -130,7 +130,7 @@ def observe(
         n_words, at_least = checks.length("seen", seen, -1), -(-scenery.layouts.max_texels // 32)
         checks.integer("the last axis of seen, words of 32 texels,", n_words, at_least)
         address = checks.address("seen", seen, (*lanes, n_words), torch.int32, device)
-        mask = checks.optional("clear_mask", clear_mask, lanes, torch.bool, device)
+        mask = checks.address("clear_mask", clear_mask, lanes, torch.bool, device, True)
         seen_fields = dict(seen=address, n_words=n_words, clear_mask=mask)
     elif clear_mask is not None:
         raise ValueError("clear_mask clears seen, but seen was not given")

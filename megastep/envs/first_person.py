@@ -134,7 +134,8 @@ class FirstPerson(SceneryEnv):
             imu=spaces.MultiVector(1, 3),
         )
         engine.fit(n_envs, self.n_agents * (8 * len(cameras) * n_pixels + 64), self.device)
-        self.ages = self._integers()
+        n_lanes = n_envs * self.n_agents
+        self.ages = torch.zeros(n_lanes, dtype=torch.int32, device=self.device)
         self.ended = torch.zeros_like(self.ages, dtype=torch.bool)
         self._resets = engine.Resets()
         self.privileged_space = None
@@ -142,10 +143,6 @@ class FirstPerson(SceneryEnv):
     def _furnish(self, geometries: Sequence, resample: bool) -> modules.RandomSpawns:
         """Puts into the floor plans what the game needs. Returns the spawner."""
         return modules.RandomSpawns(geometries, self.core, resample=resample)
-
-    def _integers(self) -> torch.Tensor:
-        """Returns zeros (B,) int32."""
-        return torch.zeros(self.n_envs * self.n_agents, dtype=torch.int32, device=self.device)
 
     def _begin(self, mask) -> arrdict:
         self.ended.copy_(mask)

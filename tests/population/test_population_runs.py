@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import json
 import random
 import re
 import shutil
@@ -209,8 +208,6 @@ def test_population_without_scores_copies_nobody_and_names_no_best(here, capsys)
     assert len(rows) == 9 and all(row["from"] == row["member"] for row in rows)
     assert entry.run_command("evaluate", ["run=P", "device=cpu"]) == 2
     assert "choose one with member=, 0 to 2" in capsys.readouterr().err
-    err = refused(capsys, *SMALL, "samples=64", f"population.schedule=P/{populations.FILE}")
-    assert "names no best member" in err
 
 
 def test_full_disk_is_a_warning_and_loses_no_generation(here, monkeypatch, capsys):
@@ -274,44 +271,6 @@ def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
     assert not Path("third").exists()
 
 
-def replayed(here, root, folder):
-    """Trains one agent with the settings over time of the best member of a population, from the
-    seed of its first ancestor. Returns the members of the line, and the samples of each generation.
-    """
-    path = here / root / populations.FILE
-    generations = populations.read(path)
-    samples = [rows[0]["samples"] for rows in generations]
-    timetable = populations.schedule(path)
-    assert [n for n, _ in timetable] == samples
-    of_members = [populations.lineage(generations, member) for member in range(3)]
-    line = next(
-        line
-        for line in of_members
-        if [of for _, of in timetable]
-        == [populations.settings_of(rows[m]) for rows, m in zip(generations, line)]
-    )
-    config = yaml.safe_load((here / f"{root}/member-{line[0]}/config.yaml").read_text())
-    run(*SMALL, LONG, f"population.schedule={path}", f"folder={folder}", f"seed={config['seed']}")
-    return line, samples
-
-
-def test_replay_of_a_lineage_has_its_bits_until_the_first_copy_and_its_settings_to_the_end(here):
-    """What an ancestor's rollouts and random numbers were after that, no single agent has."""
-    run(*POPULATION, LONG, "seed=2")
-    line, samples = replayed(here, "P", "one")
-    rows = json_lines.read(here / "one/metrics.jsonl")
-    own = [json_lines.read(here / f"P/member-{n}/metrics.jsonl") for n in range(3)]
-    copied = [n for n, m, after in zip(samples[1:], line, line[1:]) if m != after]
-    assert copied and 0 < copied[0] < 5120
-    alike = [row for row in rows if row["samples"] <= copied[0]]
-    assert alike == [row for row in own[line[0]] if row["samples"] <= copied[0]]
-    assert rows != own[line[-1]]
-    for i, row in enumerate(rows):
-        # settings of a generation hold from the update after it
-        member = [m for n, m in zip(samples, line) if n < row["samples"]][-1]
-        assert row["lr"] == own[member][i]["lr"], row["samples"]
-
-
 def test_a_member_that_diverges_is_replaced_and_named(here, capsys):
     words = [*POPULATION[:-2], "population.vary={learner.lr: {choices: [1e-3, 1e6]}}"]
     words = [
@@ -362,7 +321,6 @@ BAD = {
     "league": (["population.score=won/league"], "is not a mean over episodes here"),
     "ranks": (["ranks=4"], "more than population.size=3"),
     "member": (["population.member=1"], "is set by a population"),
-    "file": (["population.size=1", "population.vary={}", "population.schedule=x"], "no file 'x'"),
 }
 
 
@@ -372,14 +330,6 @@ def test_bad_input_is_one_sentence(here, capsys, case):
     err = refused(capsys, *POPULATION, "samples=64", *words)
     assert any(part in err for part in text.split("|")), err
     assert "Traceback" not in err and not (here / "P").exists()
-
-
-def test_a_schedule_of_settings_that_the_agent_lacks_is_refused(here, capsys):
-    row = {"samples": 0, "generation": 0, "member": 0, "from": 0, "score": 1.0}
-    (here / "other.jsonl").write_text(json.dumps(row | {"settings/env.kill_reward": 2.0}) + "\n")
-    err = refused(capsys, *SMALL, "samples=64", "population.schedule=other.jsonl", "folder=one")
-    assert "env.kill_reward cannot change while training" in err and "Traceback" not in err
-    assert not (here / "one").exists()
 
 
 class WithoutCopies(PPO):

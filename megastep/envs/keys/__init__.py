@@ -89,7 +89,7 @@ class Keys(FirstPerson):
         self.obs_space["keys"] = spaces.MultiVector(1, doors, low=0, high=1)
         if privileged:
             self.privileged_space = dotdict(places=spaces.MultiVector(1, 2 * doors + 3))
-        self.opened, self.n_draws = self._integers(), self._integers()
+        self.opened, self.n_draws = torch.zeros_like(self.ages), torch.zeros_like(self.ages)
 
     def _furnish(self, geometries, resample) -> modules.RandomSpawns:
         self.seed = derived_seed(self.core.seed, "keys")

@@ -129,7 +129,7 @@ class Memory(FirstPerson):
             self.privileged_space = dotdict(
                 goal=spaces.MultiVector(1, N_GOAL), places=spaces.MultiVector(1, 2 * objects)
             )
-        self.cue, self.found, self.n_draws = (self._integers() for _ in range(3))
+        self.cue, self.found, self.n_draws = (torch.zeros_like(self.ages) for _ in range(3))
 
     def _furnish(self, geometries, resample) -> modules.RandomSpawns:
         self.seed = derived_seed(self.core.seed, "memory")

@@ -109,7 +109,7 @@ class PointGoal(FirstPerson):
         self.obs_space["goal"] = spaces.MultiVector(1, 3, **bounds)
         if privileged:
             self.privileged_space = dotdict(way=spaces.MultiVector(1, N_PRIVILEGED))
-        self.goal_index, self.n_draws = self._integers(), self._integers()
+        self.goal_index, self.n_draws = torch.zeros_like(self.ages), torch.zeros_like(self.ages)
         # x and y one step ago; metres to go by the shortest path, now and at the start; length of
         # the shortest path from the start; metres walked; collisions
         self.progress = torch.zeros((PROGRESS_ROWS, self.n_envs), device=self.device)
