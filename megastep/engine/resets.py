@@ -75,7 +75,8 @@ class Resets:
         if seed is not None:
             self._seed(env, seed, chosen)
         if mask is None or world is None:
-            return self.keep(begin(chosen))
+            self.last = begin(chosen)
+            return self.last
         self.is_used = True
         rows, leaves = [*self._rows(env)], _pytree.tree_leaves(world)
         before = _copies([*(leaf for leaf, _ in rows), *leaves])

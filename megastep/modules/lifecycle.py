@@ -44,8 +44,9 @@ def random_ages(limits: torch.Tensor, seed: int) -> torch.Tensor:
     """Returns ages (B,) int32 at which lanes could be in the middle of an episode that is truncated
     at an age of ``limits`` (B,) int32: uniform in [0, limit), and 0 where that is ``ENDLESS``.
     """
-    generator = CounterGenerator(len(limits), derived_seed(seed, "ages"), limits.device)
-    uniform = generator(torch.ones_like(limits, dtype=torch.bool))[:, 0]
+    counts, everywhere = torch.zeros_like(limits), torch.ones_like(limits, dtype=torch.bool)
+    numbers = torch.zeros((len(limits), 4), device=limits.device)
+    uniform = engine.uniform(counts, everywhere, derived_seed(seed, "ages"), numbers)[:, 0]
     ages = (uniform.double() * limits).int()  # in double precision it stays below the limit
     return ages.masked_fill_(limits == ENDLESS, 0)
 

@@ -16,7 +16,6 @@ from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.geometry import centers, contents
 from megastep.modules.lifecycle import CounterGenerator, derived_seed
-from megastep.modules.movement import to_agents
 
 T = TypeVar("T")
 CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other spawned agents
@@ -164,7 +163,7 @@ class RandomSpawns:
         checks.length("reset", reset)
         core, draws = self.core, (self.points, self.counts, self.seed)
         options = self.resample, self.hidden, self.point_index, self.cumulative
-        mask = to_agents(reset, core.n_agents)
+        mask = reset.reshape(-1, core.n_agents)
         engine.spawn(core.scenery, core.agents, mask, *draws, *options)
 
     def weigh_layouts(self) -> torch.Tensor:
