@@ -9,23 +9,25 @@ Prints a row for each hider and seeker, with 95 % intervals over rooms. Players 
 
 import argparse
 import math
+import os
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # idle threads of PyTorch must not spin
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 import torch
 from scipy import ndimage
 
-import megastep  # noqa: F401  (before torch)
 from megastep.agents.evaluation import eval_env, playing, statistics
 from megastep.agents.evaluation.eval_env import EvalEnv, Player
 from megastep.agents.factory import make as factory
 from megastep.agents.factory import settings
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.runs import folders
+from megastep.types import optional
 
 CELL = 0.015  # metres
 SLOP = 0.005  # metres by which agents and bodies may overlap
@@ -94,7 +96,8 @@ def floor_of(walls: np.ndarray, bodies: np.ndarray, radius: float) -> Floor:
         ahead = (np.abs(c * dx + s * dy) - length).clip(0)
         aside = (np.abs(c * dy - s * dx) - thick).clip(0)
         part &= ahead**2 + aside**2 >= reach**2
-    return Floor(ndimage.label(free, np.ones((3, 3)))[0], corner)
+    parts: Any = ndimage.label(free, np.ones((3, 3)))
+    return Floor(parts[0], corner)
 
 
 def are_closed_in(floor: Floor, hiders: np.ndarray, seekers: np.ndarray) -> bool:
@@ -208,7 +211,7 @@ def row_of(found: dict[str, np.ndarray]) -> list[str]:
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(description="Measures hide and seek.")
     parser.add_argument("--hiders", nargs="+", required=True, help="runs, untrained, or bots")
     parser.add_argument("--seekers", nargs="+", required=True, help="likewise")
     parser.add_argument("--episodes", type=int, default=1024)
@@ -225,8 +228,8 @@ def main(argv=None) -> None:
     env_settings = settings.changed(trained.env, movable=not args.frozen, resample=False)
     geometry = settings.changed(trained.geometry, n=args.episodes)
     homes = factory.homes(env_settings, geometry, "test")
-    n_lanes = args.episodes * factory.make_sample(env_settings, homes, device=device).n_agents
-    where = EvalEnv(env_settings, homes, n_lanes, args.seed, device)
+    n_agents = optional(factory.make_sample(env_settings, homes, device=device), "n_agents")
+    where = EvalEnv(env_settings, homes, args.episodes * n_agents, args.seed, device)
     print(f"{where.env.n_envs:,} episodes in {len(where.homes):,} unseen rooms")
     print("| " + " | ".join(["hiders", "seekers", *COLUMNS.values()]) + " |")
     print("| --- " * (len(COLUMNS) + 2) + "|")

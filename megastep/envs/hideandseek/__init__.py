@@ -289,32 +289,26 @@ class HideAndSeek(FirstPerson):
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`, (A, ...) of its agents."""
-        objects, is_open = self.objects.all, ~self.blind[e]
+        is_open = ~self.blind[e]
         return arrdict(
             self._seen_by(e).map(lambda leaf: leaf * is_open.view(-1, *[1] * (leaf.ndim - 1))),
-            core=self.core.state(e),
+            core=arrdict(self.core.state(e), teams=(~self.is_hider).long()),
             age=self.steps[e].clone(),
             left=(self.prep - self.steps[e]).clamp(min=0),
             seen=self.seen[e].clone(),
             is_hider=self.is_hider,
-            holders=objects.holders[e].clone(),
         )
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
-        """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
-        each agent to what it holds, and each agent's RGB and depth.
+        """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with the teams,
+        what they hold and have locked in a colour each, and each agent's RGB and depth.
         """
         n_agents, n_seen = len(state.seen), int((state.seen & state.is_hider).sum())
         phase = f"{state.left} steps of preparation" if state.left else f"{n_seen} hiders seen"
         title = f"step {state.age} · {phase}"
         figure, plan, strips = plotting.panels(4 * -(-n_agents // 2), title=title, columns=2)
         Core.plot_state(state.core, plan)
-        colours, positions = plotting.camera_colours(n_agents), state.core.positions
-        for k, agent in enumerate(state.holders):
-            if agent >= 0:
-                at = state.core.objects.positions[k]
-                plotting.plot_shot(plan, positions[agent], at, colours[agent])
         above = [strips[2 * agent - agent % 2] for agent in range(n_agents)]
         modules.RGB.plot_state(state.rgb, above)
         below = [strips[2 * agent - agent % 2 + 2] for agent in range(n_agents)]

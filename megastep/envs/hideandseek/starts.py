@@ -43,6 +43,8 @@ def starts(
 
 
 def _starts(g, n, radii, rooms, random) -> np.ndarray:
+    from scipy.spatial.distance import cdist  # which takes a while to import
+
     if INNER in rooms and "inner" not in g:
         raise ValueError(
             f"geometry {g.id} has no inner room, which variant=quadrant needs: use "
@@ -52,29 +54,30 @@ def _starts(g, n, radii, rooms, random) -> np.ndarray:
     from_wall = distances(points, g.walls)
     room = g.masks[tuple(geometry.indices(points, g.masks.shape, g.res).T)]
     is_in = np.array([room > 0, room != g.get("inner"), room == g.get("inner")])
-    places = [
-        np.flatnonzero(is_in[room] & (from_wall > radius + CLEARANCE))
-        for radius, room in zip(radii, rooms)
-    ]
-    chosen = [_start(points, places, radii, random) for _ in range(n)]
+    places = [is_in[room] & (from_wall > radius + CLEARANCE) for radius, room in zip(radii, rooms)]
+    apart = cdist(points, points) - CLEARANCE
+    chosen = [_start(apart, places, np.asarray(radii), random) for _ in range(n)]
     if any(one is None for one in chosen):
         raise ValueError(
             f"geometry {g.id} has no room for {len(radii)} agents and objects of up to "
             f"{2 * max(radii):.2g} m: use fewer, or larger floor plans"
         )
-    return np.stack(chosen)  # pyright: ignore[reportArgumentType]
+    return points[np.stack(chosen)]  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
-def _start(points, places, radii, random) -> np.ndarray | None:
-    """Draws a point for each disc, the largest first; None if that failed too often."""
+def _start(apart, places, radii, random) -> np.ndarray | None:
+    """Draws the index of a point for each disc, the largest first; None if that failed too often.
+    Points are ``apart`` (P, P) metres beyond the clearance, and (P,) bool of each disc its places.
+    """
+    order = np.argsort(radii, kind="stable")[::-1]
     for _ in range(ROUNDS):
-        start, near = np.full((len(radii), 2), np.inf), np.asarray(radii) + CLEARANCE
-        for k in np.argsort(radii, kind="stable")[::-1]:
-            apart = np.linalg.norm(points[places[k], None] - start, axis=-1)
-            free = places[k][(apart > near + radii[k]).all(1)]
+        room, start = np.full(len(apart), np.inf), np.zeros(len(radii), int)
+        for k in order:
+            free = np.flatnonzero(places[k] & (room > radii[k]))
             if not len(free):
                 break
-            start[k] = points[free[random.integers(len(free))]]
+            start[k] = free[random.integers(len(free))]
+            room = np.minimum(room, apart[start[k]] - radii[k])
         else:
             return start
     return None
