@@ -257,10 +257,15 @@ class HideAndSeek(FirstPerson):
     def _world(self, free=None, actions=None) -> arrdict:
         self.spawner(self.ended)
         out, view = self._judge(actions), self._view()
-        blind = self.blind[..., None, None]
-        for image in (view.rgb, view.depth):  # of seekers that wait
-            assert image is not None
-            image.masked_fill_(blind.view(*blind.shape[:2], *[1] * (image.ndim - 2)), 0)
+        assert view.depth is not None
+        launch(
+            *(LIBRARY, "hideandseek_images", self.device, len(self.ended)),
+            blind=self.blind,
+            rgb=view.rgb,
+            depth=view.depth,
+            n_lanes=len(self.ended),
+            n_pixels=view.depth.shape[-1],
+        )
         world = world_of(out, arrdict(images(view), state=out["state"]), METRICS)
         if out["privileged"] is not None:
             world["privileged"] = out["privileged"]
