@@ -119,6 +119,10 @@ class HideAndSeek(FirstPerson):
             ``ramp``. Owners are 0 for hiders, 1 for seekers.
     """
 
+    #: Keys of a page that plays it.
+    controls = {"ArrowUp": 3, "ArrowDown": 4, "ArrowLeft": 5, "ArrowRight": 6, "a": 1, "d": 2}
+    controls |= {"g": 7, "l": 8}
+
     @checked
     def __init__(
         self,

@@ -36,7 +36,7 @@ def starts(
 ) -> np.ndarray:
     """Returns n random starts of each geometry, (D, n, A + K, 2) float32 metres: points such that
     discs of these radii are 5 cm clear of each other and of every wall, each in its room: ANYWHERE,
-    OUTER or INNER. ValueError if a geometry lacks a room, or has no space.
+    OUTER, or INNER if they fit there. ValueError if a geometry lacks that room, or has no space.
     """
     found = per_geometry(geometries, seed, lambda g, random: _starts(g, n, radii, rooms, random))
     return np.stack(found).astype(np.float32)
@@ -53,8 +53,9 @@ def _starts(g, n, radii, rooms, random) -> np.ndarray:
     points = next(candidates(g, N_POINTS, random))
     from_wall = distances(points, g.walls)
     room = g.masks[tuple(geometry.indices(points, g.masks.shape, g.res).T)]
-    is_in = np.array([room > 0, room != g.get("inner"), room == g.get("inner")])
-    places = [is_in[room] & (from_wall > radius + CLEARANCE) for radius, room in zip(radii, rooms)]
+    inner, fits = room == g.get("inner"), from_wall > np.reshape(radii, (-1, 1)) + CLEARANCE
+    is_in = {ANYWHERE: (room > 0,), OUTER: (~inner,), INNER: (inner, room > 0)}
+    places = [[part & fits[k] for part in is_in[one]] for k, one in enumerate(rooms)]
     apart = cdist(points, points) - CLEARANCE
     chosen = [_start(apart, places, np.asarray(radii), random) for _ in range(n)]
     if any(one is None for one in chosen):
@@ -67,13 +68,16 @@ def _starts(g, n, radii, rooms, random) -> np.ndarray:
 
 def _start(apart, places, radii, random) -> np.ndarray | None:
     """Draws the index of a point for each disc, the largest first; None if that failed too often.
-    Points are ``apart`` (P, P) metres beyond the clearance, and (P,) bool of each disc its places.
+    Points are ``apart`` (P, P) metres beyond the clearance. ``places`` has for each disc (P,) bool
+    masks of its points: where it should be, and perhaps where it is put if it does not fit there.
     """
     order = np.argsort(radii, kind="stable")[::-1]
-    for _ in range(ROUNDS):
+    for i in range(ROUNDS):
         room, start = np.full(len(apart), np.inf), np.zeros(len(radii), int)
         for k in order:
-            free = np.flatnonzero(places[k] & (room > radii[k]))
+            fits = room > radii[k]
+            free = [np.flatnonzero(place & fits) for place in places[k][: 1 + 2 * i // ROUNDS]]
+            free = next(filter(len, free), ())
             if not len(free):
                 break
             start[k] = free[random.integers(len(free))]

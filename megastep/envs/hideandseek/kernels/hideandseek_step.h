@@ -74,16 +74,16 @@ HD void start_episode(const HideAndSeekStepParams& p, int env, int layout) {
         p.tally[TALLY * env + i] = 0.f;
 }
 
-// From an agent at (x, y) to the nearest point of a rectangular object k.
+// From an agent at (x, y) to the nearest point of a rectangular object k: 0 if it is over that.
 HD Float4 nearest_point(const ObjectsParams& o, int k, const Object& object, float x, float y) {
     Pose pose = pose_at(object.x, object.y, object.angle);
     float dx = x - object.x, dy = y - object.y;
     float half = -object.size * LOAD((const Float4*)o.ends + lines_of(o, k).first).y;
-    float along = clamp(pose.cosine * dx + pose.sine * dy, -object.size, object.size);
-    float aside = clamp(pose.cosine * dy - pose.sine * dx, -half, half);
-    float to_x = pose.cosine * along - pose.sine * aside - dx;
-    float to_y = pose.sine * along + pose.cosine * aside - dy;
-    return {to_x, to_y, to_x * to_x + to_y * to_y, 0.f};
+    float along = pose.cosine * dx + pose.sine * dy, aside = pose.cosine * dy - pose.sine * dx;
+    float back = clamp(along, -object.size, object.size) - along,
+          side = clamp(aside, -half, half) - aside;
+    return {pose.cosine * back - pose.sine * side, pose.sine * back + pose.cosine * side,
+            back * back + side * side, 0.f};
 }
 
 // Returns 1 if what is (dx, dy) from an agent is in its field of view.
