@@ -54,7 +54,7 @@ class BC(learner.GradientLearner):
         *,
         data: str,
         value_coef: learner.ScheduledCoefficient = 0.5,
-        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
+        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 8,
         seed: int = 1,
         **settings,
     ):

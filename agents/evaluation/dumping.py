@@ -255,25 +255,28 @@ class Waves:
         while not lengths.all() and len(parts) * STEPS < self.most:
             rollout = self.collect()
             parts.append(self._part(rollout))
-            if torch.device(self.told.device).type == "cuda":
-                torch.cuda.current_stream().synchronize()
-            ends = (parts[-1]["terminal"] | parts[-1]["truncated"]).numpy()
+            ends = (parts[-1]["terminal"] | parts[-1]["truncated"]).cpu().numpy()
             first = len(parts) * STEPS - STEPS + ends.argmax(1) + 1
             lengths = np.where((lengths == 0) & ends.any(1), first, lengths)
         last, arrays = self._part(rollout, last=True), {}
         for name in parts[0]:
             rows = [part[name] for part in parts]
             if name.startswith("action") or name in episodes.OUTCOMES:  # row t led to time t
-                arrays[name] = torch.cat([torch.zeros_like(rows[0][:, :1]), *rows], 1)
+                rows = [torch.zeros_like(rows[0][:, :1]), *rows]
             else:
-                arrays[name] = torch.cat([*rows, last[name]], 1)
+                rows.append(last[name])
+            whole = torch.cat(rows, 1)
+            host = torch.empty_like(whole, device="cpu", pin_memory=whole.is_cuda)
+            arrays[name] = host.copy_(whole, non_blocking=True)
+        if torch.device(self.told.device).type == "cuda":
+            torch.cuda.current_stream().synchronize()
         is_cut = np.flatnonzero((lengths == 0) | (lengths > self.most))
         lengths[is_cut] = end = min(self.most, STEPS * len(parts))
         arrays["truncated"][is_cut, end] = True
         return arrays, lengths, layout
 
     def _part(self, rollout, last=False) -> dict[str, torch.Tensor]:
-        """Returns a rollout's steps (B, T, ...), or its last observation (B, 1, ...), as stored."""
+        """Returns copies of steps (B, T, ...), or of the last observation (B, 1, ...), as stored."""
         rows = slice(-1, None) if last else slice(None, -1)
         found = {"obs": rollout.obs["seen"], "actions": rollout.actions}
         leaves = spaces.leaves(found)
@@ -288,9 +291,8 @@ class Waves:
         if rollout.mask is not None:
             masks = spaces.leaves(rollout.mask, "mask").items()
             part |= {name: leaf[rows].squeeze(2) for name, leaf in masks}
-        return {
-            k: v.transpose(0, 1).contiguous().to("cpu", non_blocking=True) for k, v in part.items()
-        }
+        order = dict(memory_format=torch.contiguous_format)
+        return {name: leaf.transpose(0, 1).clone(**order) for name, leaf in part.items()}
 
     # ---- Writing ----
 

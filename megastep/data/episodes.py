@@ -174,7 +174,8 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     parts += [directory, struct.pack(_END, b"PK\5\6", 0, 0, n, n, len(directory), offset, 0)]
     temporary = path.with_suffix(".tmp")
     try:
-        temporary.write_bytes(b"".join(parts))
+        with open(temporary, "wb") as file:
+            file.writelines(parts)  # without joining them, which would block other threads
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -182,24 +183,26 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read(path: Path) -> Arrays:
-    """Returns the arrays of an npz file. OSError, or ValueError if it is damaged."""
-    data, arrays = bytearray(path.read_bytes()), {}  # whose arrays can be written to
+    """Returns the arrays of a file of `write`. OSError, or ValueError if it is damaged."""
+    data, arrays, start = bytearray(path.read_bytes()), {}, 0  # whose arrays can be written to
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            for entry in archive.infolist():
-                if entry.compress_type == zipfile.ZIP_STORED:
-                    lengths = struct.unpack_from("<2H", data, entry.header_offset + 26)
-                    start = entry.header_offset + struct.calcsize(_LOCAL) + sum(lengths)
-                    body = memoryview(data)[start : start + entry.file_size]
-                    if zlib.crc32(body) != entry.CRC:
-                        raise ValueError(f"{entry.filename} has other bytes than were written")
-                else:
-                    body = memoryview(bytearray(archive.read(entry)))
-                length = 10 + int.from_bytes(body[8:10], "little")
-                shape, dtype = _parsed(bytes(body[:length]))
-                array = np.frombuffer(body, dtype, offset=length).reshape(shape)
-                arrays[entry.filename.removesuffix(".npy")] = array
-    except (zipfile.BadZipFile, struct.error, zlib.error) as error:
+        while (local := struct.unpack_from(_LOCAL, data, start))[0] == b"PK\3\4":
+            method, crc, n_bytes, _, n_name = *local[3:4], *local[6:10]
+            body = start + struct.calcsize(_LOCAL) + n_name
+            name, start = data[body - n_name : body].decode(), body + n_bytes
+            content = memoryview(data)[body:start]
+            if method:
+                content = memoryview(bytearray(zlib.decompress(content, -15)))
+            if zlib.crc32(content) != crc:
+                raise ValueError(f"{name} has other bytes than were written")
+            length = 10 + int.from_bytes(content[8:10], "little")
+            shape, dtype = _parsed(bytes(content[:length]))
+            array = np.frombuffer(content, dtype, offset=length).reshape(shape)
+            arrays[name.removesuffix(".npy")] = array
+        end = struct.unpack_from(_END, data, len(data) - struct.calcsize(_END))
+        if not arrays or end[0] != b"PK\5\6" or end[4] != len(arrays):
+            raise ValueError("it has no end")
+    except (ValueError, struct.error, zlib.error) as error:
         raise ValueError(f"{path} is damaged: {error}") from None
     return arrays
 
