@@ -36,6 +36,7 @@ class BC(learner.GradientLearner):
     Args:
         data: the folder of a dataset of npz files, with observations and actions of the same
             spaces. It is held on the device as a whole.
+        policy_coef: weight of the actions' negative log-likelihood.
         value_coef: weight of the value's squared error, measured in the value's own scale.
         n_minibatches: minibatches per rollout; lanes are divided among them.
 
@@ -53,6 +54,7 @@ class BC(learner.GradientLearner):
         policy: Policy,
         *,
         data: str,
+        policy_coef: learner.ScheduledCoefficient = 1.0,
         value_coef: learner.ScheduledCoefficient = 0.5,
         n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 8,
         seed: int = 1,
@@ -64,7 +66,7 @@ class BC(learner.GradientLearner):
                 "agent.critic=plain"
             )
         self.dataset, self.n_minibatches, self.seed = datasets.load(data), n_minibatches, seed
-        self.loss_coefficients = dict(value_coef=value_coef)
+        self.loss_coefficients = dict(policy_coef=policy_coef, value_coef=value_coef)
         super().__init__(policy, seed=seed, **settings)
         self.source: DatasetCollector | None = None
 
@@ -117,7 +119,7 @@ class BC(learner.GradientLearner):
             metrics = dict(
                 policy=-masked_mean(logprobs, valid), entropy=masked_mean(entropies, valid)
             )
-            loss = metrics["policy"]
+            loss = self.coefficients["policy_coef"] * metrics["policy"]
             if policy.critic is not None:
                 error = (policy.value(now.features) - batch.targets) / policy.critic.output.scale
                 metrics["value"] = masked_mean(error.square(), valid)

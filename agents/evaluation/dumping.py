@@ -266,7 +266,7 @@ class Waves:
             else:
                 rows.append(last[name])
             whole = torch.cat(rows, 1)
-            host = torch.empty_like(whole, device="cpu", pin_memory=whole.is_cuda)
+            host = torch.empty(whole.shape, dtype=whole.dtype, pin_memory=whole.is_cuda)
             arrays[name] = host.copy_(whole, non_blocking=True)
         if torch.device(self.told.device).type == "cuda":
             torch.cuda.current_stream().synchronize()

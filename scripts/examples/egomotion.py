@@ -20,6 +20,7 @@ from torch import nn
 
 from megastep import data, plotting, video
 from megastep.agents.algorithms.bc import BC
+from megastep.agents.algorithms.learner import ScheduledCoefficient
 from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
@@ -94,7 +95,7 @@ class Egomotion(BC):
 
     Args:
         queries: poses per step.
-        draw_coef: weight of the error, next to cloning, which `lr` alone cannot switch off.
+        policy_coef: weight of cloning, besides.
 
     Metrics:
         loss/depth_error: mean absolute error of depth, metres.
@@ -109,11 +110,11 @@ class Egomotion(BC):
         policy: Policy,
         *,
         queries: Annotated[int, Field(ge=1, le=64)] = 2,
-        draw_coef: Annotated[float, Field(ge=0, le=1000)] = 10.0,
+        policy_coef: ScheduledCoefficient = 0.0,
         **settings: Any,
     ):
-        self.queries, self.draw_coef = queries, draw_coef
-        super().__init__(policy, **settings)
+        self.queries = queries
+        super().__init__(policy, policy_coef=policy_coef, **settings)
 
     def extra_parameters(self) -> Any:
         space: Any = self.policy.obs_space
@@ -137,7 +138,7 @@ class Egomotion(BC):
             depth = depth + masked_mean(error[..., 0], valid) / self.queries
             colour = colour + masked_mean(error[..., 1:].mean(-1), valid) / self.queries
         metrics = dict(depth_error=FAR * depth, colour_error=colour)
-        return self.draw_coef * (depth + colour), metrics
+        return 10 * (depth + colour), metrics
 
 
 class Frozen(PPO):
