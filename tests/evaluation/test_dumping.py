@@ -165,6 +165,14 @@ def test_a_stopped_dump_goes_on_to_the_same_bytes(few, tmp_path, monkeypatch):
     )
 
 
+def test_a_single_lane_keeps_all_its_steps(tmp_path, monkeypatch):
+    words, found = [*HOMES, "max_steps=20"], []
+    for steps in 8, 32:
+        monkeypatch.setattr(dumping, "STEPS", steps)
+        found.append(contents(dumped(tmp_path / f"{steps}", *words, n=1)))
+    assert found[0] == found[1]
+
+
 def test_environments_of_others_repeat_their_waves(few, tmp_path):
     """Those without seeded resets are made anew for each wave."""
     words = "env=gymnasium", "env.id=CartPole-v1"
@@ -266,6 +274,17 @@ def test_load_refuses_what_is_no_dataset(mazes, tmp_path):
     (tmp_path / "dataset.json").write_text("[]")
     with pytest.raises(data.DatasetError, match="cannot be read"):
         data.load(tmp_path)
+
+
+@pytest.mark.parametrize("kept", [slice(100), slice(-30), slice(5_000, 5_001)])
+def test_a_damaged_file_is_one_sentence(kept, mazes, tmp_path):
+    folder = shutil.copytree(mazes, tmp_path / "data")
+    path = folder / "episode-000001.npz"
+    whole = path.read_bytes()
+    flipped = whole[:5_000] + bytes([whole[5_000] ^ 1]) + whole[5_001:]
+    path.write_bytes(whole[kept] if kept.start is None else flipped)
+    with pytest.raises(data.DatasetError, match="episode-000001.npz is damaged"):
+        data.load(folder)[1]
 
 
 # ---- Other formats ----
