@@ -265,9 +265,8 @@ class Waves:
                 rows = [torch.zeros_like(rows[0][:, :1]), *rows]
             else:
                 rows.append(last[name])
-            whole = torch.cat(rows, 1)
-            host = torch.empty(whole.shape, dtype=whole.dtype, pin_memory=whole.is_cuda)
-            arrays[name] = host.copy_(whole, non_blocking=True)
+            # asynchronously, into pinned memory
+            arrays[name] = torch.cat(rows, 1).to("cpu", non_blocking=True)
         if torch.device(self.told.device).type == "cuda":
             torch.cuda.current_stream().synchronize()
         is_cut = np.flatnonzero((lengths == 0) | (lengths > self.most))
