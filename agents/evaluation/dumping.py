@@ -275,7 +275,7 @@ class Waves:
         return arrays, lengths, layout
 
     def _part(self, rollout, last=False) -> dict[str, torch.Tensor]:
-        """Returns copies of steps (B, T, ...), or of the last observation (B, 1, ...), as stored."""
+        """Returns copies of steps (B, T, ...), or the last observation (B, 1, ...), as stored."""
         rows = slice(-1, None) if last else slice(None, -1)
         found = {"obs": rollout.obs["seen"], "actions": rollout.actions}
         leaves = spaces.leaves(found)
