@@ -175,14 +175,17 @@ def write(run: Path, path: Path) -> str:
 
 def description(step: Step, env: Env) -> dict:
     """Returns what a program beside a policy's file must know: steps per second, names and shapes,
-    bounds of continuous actions, and what the environment's ``describe()`` says, if it has one.
+    bounds and distributions of continuous actions, and what the environment's ``describe()`` says, if it has one.
     """
     sides = json.loads(step.ports)
     for port in sides["outputs"]:
         path = port["name"].partition(".")[2]
         space = spaces.leaves(env.action_space).get(path)
-        if port["name"].startswith("action") and isinstance(space, spaces.MultiContinuous):
-            port.update(low=space.low, high=space.high)
+        if isinstance(space, spaces.MultiContinuous):
+            if port["name"].startswith("action"):
+                port.update(low=space.low, high=space.high)
+            elif port["name"].startswith("logits"):
+                port.update(distribution=step.policy.settings["continuous"])
     about = getattr(env, "describe", dict)()
     return {"steps_per_second": optional(env, "fps"), **sides, **about}
 

@@ -26,6 +26,7 @@ ABOUT = dict(
     robot={name: getattr(ROBOT, name) for name in ROBOT.__dataclass_fields__},
     steps_per_second=10.0,
     reach=0.2,
+    limit=500,
 )
 
 
@@ -58,6 +59,7 @@ def test_the_description_is_enough_to_act_as_the_policy_does(exported):
     """From metres, m/s and rad/s; observations in megastep are rounded to float16."""
     env, policy, path = exported
     outside, world, state = RobotPolicy(path), env.reset(), policy.initial(3)
+    outside.begin(seed=None)
     assert outside.rate == 10.0
     n_steps = 0
     while n_steps < 25 and not world.terminal[0]:
@@ -207,7 +209,7 @@ def test_controllers_reach_goals_in_the_open():
         (FollowPath(robot, lambda episode: corner), 4.0),
         (FollowPath(robot, lambda episode: None), 8**0.5),
     ):
-        outcome = transfer.play(world, driver, room(goal=(4.0, 4.0)), 0.2)
+        outcome = transfer.play(world, driver, room(goal=(4.0, 4.0)), ABOUT)
         assert outcome["success"] == 1 and outcome["collisions"] == 0
         walked = 2 * 2**0.5 / outcome["spl"]
         assert walked == pytest.approx(length, abs=0.45)

@@ -182,7 +182,8 @@ class PointGoal(FirstPerson):
                 "range_max": self.robot.range_max,
             }
         action = {"names": ["linear.x", "angular.z"], "units": ["m/s", "rad/s"], "high": limits}
-        return {"robot": robot, "observations": sensors, "actions": action, "reach": REACH}
+        task = {"reach": REACH, "limit": self.limit}  # metres, steps
+        return {"robot": robot, "observations": sensors, "actions": action, **task}
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""

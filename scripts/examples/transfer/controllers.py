@@ -10,13 +10,13 @@ from episodes import to_robot
 
 
 class Trained:
-    """The exported policy."""
+    """The exported policy, which draws actions, or takes their means."""
 
-    def __init__(self, policy):
-        self.policy = policy
+    def __init__(self, policy, draws=True):
+        self.policy, self.draws = policy, draws
 
     def begin(self, episode):
-        self.policy.begin()
+        self.policy.begin(episode.number if self.draws else None)
 
     def act(self, ranges, twist, pose, goal):
         return self.policy.act(ranges, twist, goal)

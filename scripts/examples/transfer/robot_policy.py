@@ -7,7 +7,8 @@ import numpy as np
 
 
 class RobotPolicy:
-    """Drives a robot to a goal by ranges and odometry. Remembers by its hidden state.
+    """Drives a robot to a goal by ranges and odometry. Remembers by its hidden state. It draws
+    actions as in training, since one that always repeats the best action stays where it is stuck.
 
     Args:
         path: the .onnx file. The description, .json, lies beside it.
@@ -36,6 +37,8 @@ class RobotPolicy:
         }
         self.seen = "obs.rgb" if "obs.rgb" in shapes else "obs.scan"
         self.scan = self.about["observations"].get("scan")
+        outputs = {port["name"]: port for port in self.about["outputs"]}
+        self.is_beta = outputs["logits"].get("distribution") == "beta"
         self.limits = np.array(self.about["actions"]["high"])
         self.begin()
 
@@ -44,8 +47,11 @@ class RobotPolicy:
         """Actions per second."""
         return self.about["steps_per_second"]
 
-    def begin(self) -> None:
-        """Forgets, at the start of an episode."""
+    def begin(self, seed: int | None = 1) -> None:
+        """Forgets, at the start of an episode. A seed is that of the actions, which are drawn from
+        a Beta distribution; None: takes its mean.
+        """
+        self.random = None if seed is None else np.random.default_rng(seed)
         for name, value in self.feeds.items():
             if name.startswith("state"):
                 value[:] = 0
@@ -83,8 +89,11 @@ class RobotPolicy:
         feeds["obs.odom"][0, 0] = twist / self.limits
         direction = goal / distance if distance else np.array([1.0, 0.0])
         feeds["obs.goal"][0, 0] = distance / 10, *direction
-        action, _, *state = self.session.run(None, feeds)
+        action, logits, *state = self.session.run(None, feeds)
         for k, leaf in enumerate(state):
             feeds[f"state.{k}"] = leaf
         feeds["reset"] = np.zeros(1, bool)
-        return action[0, 0]
+        if self.random is None or not self.is_beta:
+            return action[0, 0]
+        alpha, beta = np.split(logits[0, 0].astype(float), 2)
+        return self.limits * (2 * self.random.beta(alpha, beta) - 1)

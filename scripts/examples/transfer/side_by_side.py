@@ -36,7 +36,7 @@ def record(name, policy, episode):
             scan, odometry = world.messages()
             messages.append(dict(scan=scan, odometry=odometry))
 
-    outcome = play(world, Trained(policy), episode, policy.about["reach"], keep)
+    outcome = play(world, Trained(policy), episode, policy.about, keep)
     return np.array(poses), scans, views, messages, outcome
 
 

@@ -8,7 +8,8 @@
     python transfer.py homes.npz --table
 
 Needs onnxruntime, and `ir-sim` or `mujoco` for these simulators. Outcomes are added to HOMES.jsonl;
-what is in there already is left out. --label names another policy than `trained`.
+what is in there already is left out. `means` is the policy without its randomness, and --label names
+another policy than `trained`.
 """
 
 import argparse
@@ -24,7 +25,6 @@ import numpy as np
 from episodes import read, to_robot
 from robot_policy import RobotPolicy
 
-LIMIT = 500  # steps of an episode
 METRICS = "success", "spl", "collisions", "seconds"
 #: Simulators: module, class, what to install.
 SIMULATORS = {
@@ -47,8 +47,8 @@ def simulator(name, about):
 def controller(name, policy):
     """Returns what drives, by name."""
     robot = policy.about["robot"]
-    if name == "trained":
-        return controllers.Trained(policy)
+    if name in ("trained", "means"):
+        return controllers.Trained(policy, draws=name == "trained")
     if name == "planner":
         from in_irsim import plan
 
@@ -56,16 +56,15 @@ def controller(name, policy):
     return {"random": controllers.Random, "scripted": controllers.Scripted}[name](robot)
 
 
-def play(world, driver, episode, reach, keep=None):
-    """Plays one episode. Returns {metric: number}; seconds are those to the goal, or of all steps.
+def play(world, driver, episode, about, keep=None):
+    """Plays one episode, to the reach and within the limit of a description. Returns {metric:
+    number}; seconds are those to the goal, or of all steps.
     ``keep(world, pose, ranges)`` is called before each step.
     """
     world.begin(episode)
     driver.begin(episode)
     walked, collisions, thought, pose = 0.0, 0, 0.0, world.pose()
-    step = 0
-    while step < LIMIT:
-        step += 1
+    for step in range(1, about["limit"] + 1):
         ranges = world.sense()
         if keep is not None:
             keep(world, pose, ranges)
@@ -75,14 +74,14 @@ def play(world, driver, episode, reach, keep=None):
         collisions += world.drive(command)
         before, pose = pose, world.pose()
         walked += float(np.hypot(*(pose - before)[:2]))
-        success = float(np.hypot(*(pose[:2] - episode.goal))) <= reach
+        success = float(np.hypot(*(pose[:2] - episode.goal))) <= about["reach"]
         if success:
             break
     return dict(
         success=float(success),
         spl=success * episode.shortest / max(episode.shortest, walked, 1e-6),
         collisions=int(collisions),
-        seconds=step * getattr(world, "seconds", 0.1),
+        seconds=step / about["steps_per_second"],
         ms=1000 * thought / step,
     )
 
@@ -143,7 +142,7 @@ def main():
     parser.add_argument("episodes")
     parser.add_argument("--policy")
     parser.add_argument("--label", default="trained")
-    names = ["trained", "random", "scripted", "planner"]
+    names = ["trained", "means", "random", "scripted", "planner"]
     parser.add_argument("--controllers", nargs="+", default=["trained"], choices=names)
     parser.add_argument("--simulators", nargs="+", default=["megastep"], choices=[*SIMULATORS])
     parser.add_argument("--first", type=int, default=0, help="of the episodes")
@@ -171,7 +170,7 @@ def main():
                         continue
                     row = dict(driver=label, simulator=name, episode=episode.number)
                     row |= dict(home=episode.home)
-                    row |= play(world, driver, episode, policy.about["reach"])
+                    row |= play(world, driver, episode, policy.about)
                     rows.append(row)
                     with log.open("a") as file:
                         file.write(json.dumps(row) + "\n")
