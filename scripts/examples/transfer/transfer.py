@@ -8,8 +8,8 @@
     python transfer.py homes.npz --table
 
 Needs onnxruntime, and `ir-sim` or `mujoco` for these simulators. Outcomes are added to HOMES.jsonl;
-what is in there already is left out. `means` is the policy without its randomness, and --label names
-another policy than `trained`.
+what is in there already is left out. `means` is the policy that takes the means of its actions;
+--label names another one than `trained`.
 """
 
 import argparse
@@ -25,7 +25,6 @@ import numpy as np
 from episodes import read, to_robot
 from robot_policy import RobotPolicy
 
-METRICS = "success", "spl", "collisions", "seconds"
 #: Simulators: module, class, what to install.
 SIMULATORS = {
     "megastep": ("in_megastep", "InMegastep", "megastep-flatland"),
@@ -63,8 +62,9 @@ def play(world, driver, episode, about, keep=None):
     """
     world.begin(episode)
     driver.begin(episode)
-    walked, collisions, thought, pose = 0.0, 0, 0.0, world.pose()
-    for step in range(1, about["limit"] + 1):
+    walked, collisions, thought, step, pose = 0.0, 0, 0.0, 0, world.pose()
+    while step < about["limit"]:
+        step += 1
         ranges = world.sense()
         if keep is not None:
             keep(world, pose, ranges)
@@ -168,10 +168,9 @@ def main():
                 for episode in episodes:
                     if (label, name, episode.number) in known:
                         continue
-                    row = dict(driver=label, simulator=name, episode=episode.number)
-                    row |= dict(home=episode.home)
-                    row |= play(world, driver, episode, policy.about)
-                    rows.append(row)
+                    names = dict(driver=label, simulator=name, episode=episode.number)
+                    outcome = play(world, driver, episode, policy.about)
+                    rows.append(row := dict(names, home=episode.home, **outcome))
                     with log.open("a") as file:
                         file.write(json.dumps(row) + "\n")
     print(table(rows))
