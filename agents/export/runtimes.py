@@ -175,7 +175,8 @@ def write(run: Path, path: Path) -> str:
 
 def description(step: Step, env: Env) -> dict:
     """Returns what a program beside a policy's file must know: steps per second, names and shapes,
-    bounds and distributions of continuous actions, and what the environment's ``describe()`` says, if it has one.
+    bounds and distributions of continuous actions, and what the environment's ``describe()`` says,
+    if it has one.
     """
     sides = json.loads(step.ports)
     for port in sides["outputs"]:
