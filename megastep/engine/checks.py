@@ -145,7 +145,7 @@ def address(
     """Returns the address of a contiguous tensor of that shape, dtype and device, or raises; a null
     pointer for None, if it ``is_optional``.
     """
-    if value is None and is_optional:
+    if is_optional and value is None:
         return 0
     try:
         fits = (
