@@ -40,8 +40,8 @@ def generate(seed: int, width: float = 6.0, opening: float = 0.45) -> dotdict:
         cells[1, 1] = INDOORS
     if has_opening[1]:
         cells[3, 3] = INDOORS
-    framed = [np.concatenate([[-1], lines, [wide + 1]]) for lines in (xs, ys)]
-    walls = (segments(*framed, np.pad(cells, 1, constant_values=WALL), INDOORS) + START) / 1000
+    xs, ys = (np.concatenate([[-1], lines, [wide + 1]]) for lines in (xs, ys))
+    walls = (segments(xs, ys, np.pad(cells, 1, constant_values=WALL), INDOORS) + START) / 1000
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     outer, inner = corners * wide, corners * (wide - half) + (half, 0)
     doors = [

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 from adapter_steps import adapters
 from engine_operations import agents, cpu, kernels, observe
-from env_steps import deathmatch, mazes, memory, objects, pong, pushing, step
+from env_steps import deathmatch, hideandseek, mazes, memory, objects, pong, step
 from populations import members, small_members
 from scaling import scaling
 from training import startup, train
@@ -15,7 +15,7 @@ from training import startup, train
 ALL = (
     step,
     objects,
-    pushing,
+    hideandseek,
     mazes,
     kernels,
     observe,

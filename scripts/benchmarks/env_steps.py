@@ -1,12 +1,11 @@
-"""Benchmarks of whole environments: `step`, `objects`, `pushing`, `mazes`, `deathmatch`, `pong`,
-`memory`.
+"""Benchmarks of whole environments: `step`, `objects`, `hideandseek`, `mazes`, `deathmatch`,
+`pong`, `memory`.
 """
 
 import itertools
 from collections.abc import Iterator
 
 import torch
-from pushing import KINDS, Pushing
 from random_walks import N_HOMES, random_actions, walk, walk_in_homes, walk_in_rollouts
 from timing import graph_seconds_per_call, lap_seconds, measurement, rate, seconds_per_call
 
@@ -63,16 +62,18 @@ def objects(device: torch.device) -> Iterator[dict]:
             yield rate(what, n_envs, seconds_per_call(take_step, device))
 
 
-def pushing(device: torch.device) -> Iterator[dict]:
-    """Agents' frames per second of a game of four agents that push nine boxes, and of the game
-    without boxes that can be pushed: physics, rendering, reward, resets, in PyTorch.
+def hideandseek(device: torch.device) -> Iterator[dict]:
+    """Agents' frames per second of hide and seek as trained, with four agents and nine bodies: of
+    both variants, and with bodies that nothing moves.
     """
-    still = {name: kind._replace(movable=False) for name, kind in KINDS.items()}
-    for n_envs in N_ENVS_WITH_OBJECTS[device.type]:
-        for name, kinds in (("movable", KINDS), ("that stay", still)):
-            _, take_step = walk(Pushing(n_envs, device, kinds=kinds))
-            what = f"pushing, `env.step`, {n_envs:,} environments of 4 agents, 9 boxes {name}"
-            yield rate(what, 4 * n_envs, seconds_per_call(take_step, device))
+    bodies = dict(n_boxes=6, n_long=2, n_ramps=1, resample=True, privileged=True)
+    cases = ("quadrant", True), ("quadrant", False), ("homes", True)
+    for n_envs, (variant, movable) in itertools.product(N_ENVS_WITH_OBJECTS[device.type], cases):
+        rooms, options = sample(variant, N_HOMES), dict(variant=variant, movable=movable, **bodies)
+        _, take_step = walk(envs.HideAndSeek(n_envs, rooms, device=device, **options))
+        what = f"hide and seek, `env.step`, {n_envs:,} environments of 4 agents, {variant}"
+        what += ", 9 bodies" + ("" if movable else " that stay")
+        yield rate(what, 4 * n_envs, seconds_per_call(take_step, device))
 
 
 def mazes(device: torch.device) -> Iterator[dict]:

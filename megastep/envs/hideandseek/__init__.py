@@ -39,9 +39,9 @@ METRICS = "hidden", *(name.format(kind) for kind in ("box", "ramp") for name in 
 N_STARTS = 32  # per layout
 REACH = 0.25  # metres from an agent's centre to what it grabs or locks, as in the original
 #: Bodies: an agent of 1 kg pushes with 20 N.
-BOX = dict(side=0.6, mass=1.0, friction=0.4)
-LONG = dict(side=1.2, width=0.2, mass=1.0, friction=0.4)
-RAMP = dict(side=0.6, width=0.4, mass=1.0, friction=0.4)
+BOX: dict = dict(side=0.6, mass=1.0, friction=0.4)
+LONG: dict = dict(side=1.2, width=0.2, mass=1.0, friction=0.4)
+RAMP: dict = dict(side=0.6, width=0.4, mass=1.0, friction=0.4)
 #: Of boxes, elongated ones and ramps; then of what hiders and seekers have locked.
 COLOURS = "yellow", "orange", "green", "cyan", "red"
 TEAMS = "blue", "magenta"  # colours of hiders and seekers
