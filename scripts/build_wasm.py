@@ -27,7 +27,7 @@ LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MINATAR, MINIGRID, ME
 LIBRARIES += HIDEANDSEEK, POLICY
 #: Operations of setting up, of scripted bots and of robots, which no page launches.
 ABSENT = {
-    *("bake", "place_objects", "physics_bodies", "uniform", "bot", "scan"),
+    *("bake", "place_objects", "uniform", "bot", "scan"),
 }
 
 

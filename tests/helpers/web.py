@@ -1,8 +1,21 @@
 """Small environments that a page can play, each with short episodes."""
 
-from megastep import envs, geometries
+import torch
+
+from megastep import envs, geometries, modules
 
 __all__ = ["ENVS", "made"]
+
+
+def pushing(geometries, **settings):
+    """Explorer with crates, balls and a ramp that the agent pushes, or drives up."""
+    env = envs.Explorer(geometries=geometries, **settings)
+    crate, ball = modules.Crate(6, 0.3, movable=True, width=0.2), modules.Disc(6, movable=True)
+    kinds = {"crate": crate, "ball": ball, "ramp": modules.Ramp(4, 0.3, 0.3)}
+    for kind in modules.Objects(geometries, env.core, kinds).kinds.values():
+        kind.place(torch.ones(env.n_envs, dtype=torch.bool))
+    return env
+
 
 ENVS = {
     "explorer": (envs.Explorer, dict(n_envs=1, patience=20, resample=True, privileged=True)),
@@ -25,6 +38,7 @@ ENVS = {
     "memory": (envs.Memory, dict(n_envs=1, limit=30, resample=True)),
     "keys": (envs.Keys, dict(n_envs=1, limit=30, resample=True)),
     "hideandseek": (envs.HideAndSeek, dict(n_envs=1, limit=30, variant="homes", resample=True)),
+    "pushing": (pushing, dict(n_envs=1, patience=20)),
 }
 
 
