@@ -2,7 +2,7 @@
 #include "physics_bodies.h"
 #include "common/warp_cuda.h"
 
-KERNEL physics_bodies(PhysicsBodiesParams p) {
+KERNEL BOUNDS(10) physics_bodies(PhysicsBodiesParams p) {
     wait_for_previous();
     __shared__ Bodies bodies[BLOCK / WARP];
     int warp = threadIdx.x / WARP, env = blockIdx.x * (BLOCK / WARP) + warp;

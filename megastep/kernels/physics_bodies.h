@@ -55,14 +55,15 @@ struct Bodies {
     float hold[MAX_BODIES][3];                      // impulse and torque in this substep
     float load[MAX_BODIES], load_turn[MAX_BODIES];  // their sums over all substeps
     float extent[MAX_SLOTS], speeds[MAX_SLOTS];
-    int exists[MAX_SLOTS], holders[MAX_SLOTS], hit[MAX_SLOTS];
-    int awake[MAX_SLOTS], overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
-    int elevated[MAX_SLOTS];  // of agents, as in ObjectsParams
+    signed char exists[MAX_SLOTS], holders[MAX_SLOTS], hit[MAX_SLOTS];
+    signed char awake[MAX_SLOTS], overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
+    signed char elevated[MAX_SLOTS];  // of agents, as in ObjectsParams, but 1 for all above 0
     int candidates[MAX_CANDIDATES];
-    int touch_a[MAX_TOUCHES], touch_b[MAX_TOUCHES], levels[MAX_TOUCHES];
+    signed char touch_a[MAX_TOUCHES], touch_b[MAX_TOUCHES], levels[MAX_TOUCHES];
     Touch touches[MAX_TOUCHES];
     float impulses[MAX_TOUCHES][2];
-    int last[MAX_SLOTS], n_levels;
+    signed char last[MAX_SLOTS];
+    int n_levels;
 };
 
 HD int n_slots_of(const PhysicsBodiesParams& p) { return p.scenery.n_agents + p.objects.n_bodies; }
@@ -475,6 +476,8 @@ RARE void solve_touch(Bodies& b, int k, int n_agents, float inv_h, int is_shift)
     // without the impulses so far: mass x impulses + target >= 0
     float one = target[0] - mass[0] * old[0], two = target[1] - mass[1] * old[1];
     float first = 0.f, second = 0.f;
+    if (old[0] == 0.f && old[1] == 0.f && one >= 0.f && (two >= 0.f || t.n == 1))
+        return;  // so it takes none
     if (t.n == 2) {
         one -= between * old[1];
         two -= between * old[0];
@@ -634,24 +637,27 @@ HD void solve_touches(const PhysicsBodiesParams& p, const Group& group, Bodies& 
     }
 }
 
-// Changes velocities for a substep of h seconds.
+// Changes velocities for a substep of h seconds. `holds`: 0 if no agent holds anything.
 template <class Group>
-HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches, float h) {
+HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches, float h,
+              int holds) {
     int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);
     for (int i = 0; i < ITERATIONS; i++) {
         for (int a = group.rank; a < n_agents; a += Group::SIZE)
             solve_drag(b, a, h);
         sync(group);
-        if (group.rank == 0)
-            for (int k = 0; k < p.objects.n_bodies; k++)
-                solve_hold(b, k, n_agents + k, h, p.grip);
-        sync(group);
+        if (holds) {
+            if (group.rank == 0)
+                for (int k = 0; k < p.objects.n_bodies; k++)
+                    solve_hold(b, k, n_agents + k, h, p.grip);
+            sync(group);
+        }
         solve_touches(p, group, b, n_touches, 1.f / h, 0);
         for (int k = n_agents + group.rank; k < n_slots; k += Group::SIZE)
             solve_drag(b, k, h);
         sync(group);
     }
-    for (int k = n_agents + group.rank; k < n_slots; k += Group::SIZE)
+    for (int k = n_agents + group.rank; k < n_slots && holds; k += Group::SIZE)
         add_load(b, k - n_agents);
 }
 
@@ -721,12 +727,18 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
     sync(group);
     if (p.objects.elevated) {
         int* elevated = p.objects.elevated + env * n_agents;
-        for (int a = group.rank; a < n_agents; a += Group::SIZE)
-            elevated[a] = b.elevated[a] = elevation_of(p, b, env, a);
+        for (int a = group.rank; a < n_agents; a += Group::SIZE) {
+            elevated[a] = elevation_of(p, b, env, a);
+            b.elevated[a] = mini(elevated[a], 1);
+        }
         sync(group);
     }
-    for (int k = group.rank; k < n_slots - n_agents; k += Group::SIZE)
+    unsigned int any = 0;
+    for (int k = group.rank; k < n_slots - n_agents; k += Group::SIZE) {
         begin_hold(p, b, env, k);
+        any |= b.holders[n_agents + k] >= 0;
+    }
+    int holds = reduce_or(group, any) != 0;
     sync(group);
     for (int i = group.rank; i < n_slots; i += Group::SIZE)
         b.speeds[i] = top_speed(b, i, n_agents);
@@ -772,7 +784,7 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
         for (int i = group.rank; i < n_slots; i += Group::SIZE)
             begin_substep(b, i, n_agents);
         sync(group);
-        solve(p, group, b, n_touches, h);
+        solve(p, group, b, n_touches, h, holds);
         for (int i = group.rank; i < n_slots; i += Group::SIZE)
             displace(b, i, b.velocity, h, limit);
         sync(group);

@@ -178,7 +178,11 @@ class Objects:
             for shape, size, width in zip(shapes, sizes, widths)
         ]
         radius = max(core.agents.radius, *loose)
-        points = cached_points(geometries, n_points, 1, radius, self.seed)
+        try:
+            points = cached_points(geometries, n_points, 1, radius, self.seed)
+        except ValueError as error:
+            largest = names[loose.index(max(loose))]
+            raise ValueError(f"{error}: make {largest} smaller, or the room larger") from None
         self.points = torch.as_tensor(points, device=core.device)
         self.counts = torch.zeros_like(self.all.carriers)
         self._mask = torch.zeros_like(self.all.carriers, dtype=torch.bool)

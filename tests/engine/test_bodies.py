@@ -41,18 +41,23 @@ def trajectory(device, source, n_steps=6, n_envs=6):
     if device != "cpu":
         other, others, _ = bodies.world(n_envs, source, device=device, seed=3)
         scenery, agents = other, others
-    out = []
+    out = {}
     for i, progress in enumerate(steps(scenery, agents, random, n_steps)):
-        out += [progress, *(x for _, x in sorted(state_tree((scenery.objects, agents)).items()))]
+        for name, x in {"progress": progress, **state_tree((scenery.objects, agents))}.items():
+            if isinstance(x, torch.Tensor):
+                out[f"{name} in step {i}"] = x.clone().cpu()
         if i % 3 == 0:
             hold_some(scenery, agents, random)
-    return [x.cpu().clone() for x in out if isinstance(x, torch.Tensor)]
+    return out
 
 
 def same_bits(ours, theirs):
-    for one, other in zip(ours, theirs, strict=True):
-        bits = (x.flatten().contiguous().view(torch.uint8) for x in (one, other))
-        torch.testing.assert_close(*bits, rtol=0, atol=0)
+    """Of tensors in dicts by name, or in sequences."""
+    ours, theirs = (x if isinstance(x, dict) else dict(enumerate(x)) for x in (ours, theirs))
+    assert ours.keys() == theirs.keys()
+    for name, x in ours.items():
+        bits = (one.flatten().contiguous().view(torch.uint8) for one in (x, theirs[name]))
+        torch.testing.assert_close(*bits, rtol=0, atol=0, msg=lambda text, at=name: f"{at}: {text}")
 
 
 @pytest.mark.parametrize("source", ["box", "homes", "ramps"])

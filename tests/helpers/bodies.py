@@ -50,8 +50,9 @@ def world(n_envs, source="box", n_agents=3, device="cpu", seed=1, friction=0.5, 
         engine.place_objects(scenery, agents, mask, points, placed, seed, 0.01)
         if ramps:
             angles = objects.angles[bad, :2]
-            x, y = angles.deg2rad().cos(), angles.deg2rad().sin()
-            before = torch.stack([x, y], -1) * (sizes[:2, None] + 0.2)
+            radians = angles.cpu().double().deg2rad()  # with the same cosines on any device
+            before = torch.stack([radians.cos(), radians.sin()], -1).float().to(device)
+            before *= sizes[:2, None] + 0.2
             agents.positions[bad, :2] = objects.positions[bad, :2] - before
             agents.angles[bad, :2] = angles + 10
         bad = (overlaps(scenery, agents) > 0).to(device)

@@ -229,7 +229,10 @@ def test_cameras_see_an_elongated_box_where_it_was_pushed():
         ({"box": Crate(1, movable=True, mass=1e39)}, "mass of box must be a number of kg between"),
         ({"box": Crate(1, movable=True, mass=0)}, "mass of box must be a number of kg between"),
         ({"box": Crate(1, movable=True, friction=-1)}, "friction of box must be a number between"),
-        ({"box": Crate(1, 30.0, movable=True, width=1.0)}, "no point in a room"),
+        (
+            {"box": Crate(1, 30.0, movable=True, width=1.0), "ramp": Ramp(1)},
+            "geometry 0 has no point in a room that is .* from every wall: make box 0 smaller",
+        ),
         ({"box": Crate(1, 1.0, width=2.0)}, "width of box must be a number between 0 and 1"),
         ({"ramp": Ramp(9), "box": Crate(8, 0.1, movable=True)}, "at most 16 movable objects, but"),
         ({"ramp": Ramp(1, width=0.7)}, "width of ramp must be a number between 0 and 0.6"),
