@@ -24,8 +24,8 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
     the episode's metrics. Where the environment allows some actions only, each ``info`` has them as
     ``action_mask``, int8. Play Deathmatch in rounds, ``resample=True``: otherwise it never ends.
 
-    Agents have the names of ``env.roles``, or ``agent_0``, ``agent_1``, ... ``render_mode`` is None
-    or ``rgb_array``.
+    Agents have the names of ``env.roles``, numbered if several have the same (``hider_0``), or
+    ``agent_0``, ``agent_1``, ... ``render_mode`` is None or ``rgb_array``.
     """
 
     def __init__(self, env: Env, render_mode: str | None = None):
@@ -35,8 +35,12 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
                 f"{env.n_envs}"
             )
         self.vector = vector = VectorEnv(env, render_mode=render_mode)
-        self.env, self.render_mode, roles = env, render_mode, optional(env, "roles")
-        self.possible_agents = [*(roles or (f"agent_{i}" for i in range(vector.num_envs)))]
+        self.env, self.render_mode = env, render_mode
+        roles = optional(env, "roles") or ("agent",) * vector.num_envs
+        is_team = len({*roles}) < len(roles)
+        numbers = [roles[:i].count(role) for i, role in enumerate(roles)]
+        names = (f"{role}_{i}" if is_team else role for role, i in zip(roles, numbers))
+        self.possible_agents = [*names]
         self.agents: list[str] = []
         self.metadata = {**vector.metadata, "name": f"{type(env).__name__.lower()}_v0"}
         self.observation_spaces, self.action_spaces = (

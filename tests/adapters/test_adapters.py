@@ -186,6 +186,7 @@ def test_an_extra_that_is_missing_is_named(monkeypatch):
         lambda: pong(1, self_play=True),
         lambda: envs.Deathmatch(1, HOMES, n_agents=3, resample=True, limit=40, device="cpu"),
         lambda: forage.Forage(1, HOMES, limit=30, device="cpu"),
+        lambda: envs.HideAndSeek(1, limit=30, device="cpu"),
     ),
 )
 def test_pettingzoo(make):
