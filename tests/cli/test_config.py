@@ -363,7 +363,7 @@ def test_empty_sweep(word):
 def test_help_lists_groups_and_members(capsys):
     assert train.main(["--help"]) == 0
     text = capsys.readouterr().out
-    assert "explorer, gymnasium, hideandseek, keys, memory, minatar, minigrid, minimal, pettingzoo" in text
+    assert "gymnasium, hideandseek, keys, memory, minatar, minigrid, minimal, pettingzoo" in text
     assert "quickstart" in text and "--multirun" in text
 
 
