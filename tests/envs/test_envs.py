@@ -361,6 +361,7 @@ class Launches(TorchDispatchMode):
         ("deathmatch", 0),
         ("deathmatch, privileged", 0),
         ("deathmatch, all rules", 0),
+        ("hideandseek, privileged", 0),
         ("pointgoal", 1),
         ("pointgoal, cameras", 1),
         ("pong", 0),
