@@ -80,7 +80,7 @@ def are_readable(leaves: Iterable[torch.Tensor]) -> bool:
 
 def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
     device, n_lanes = leaves[0].device, len(leaves[0])
-    is_counted = torch.as_tensor(is_counted, device=device).expand(n_lanes).contiguous()
+    is_counted = torch.ones(n_lanes, dtype=torch.bool, device=device) & is_counted
     sizes = [norm.mean.numel() for norm in norms]
     parts = torch.empty(sum(sizes), -(-n_lanes // _LANES), 3, device=device)
     flat = [leaf.flatten(1) for leaf in leaves]

@@ -32,17 +32,17 @@ Arrays = dict[str, np.ndarray]
 
 
 @functools.cache
-def _to_srgb() -> torch.Tensor:
+def _to_srgb(device: torch.device) -> torch.Tensor:
     """Returns the 8-bit sRGB value of each float16 of linear light, by its bits."""
     light = np.arange(2**16, dtype=np.uint16).view(np.float16).astype(np.float64)
     light = np.nan_to_num(light, nan=0.0).clip(0, 1)
-    return torch.from_numpy(np.round(255 * gamma_encode(light)).astype(np.uint8))
+    return torch.from_numpy(np.round(255 * gamma_encode(light)).astype(np.uint8)).to(device)
 
 
 @functools.cache
-def _to_linear() -> torch.Tensor:
+def _to_linear(device: torch.device) -> torch.Tensor:
     """Returns the linear light of each 8-bit sRGB value, float16."""
-    return torch.from_numpy(gamma_decode(np.arange(256) / 255).astype(np.float16))
+    return torch.from_numpy(gamma_decode(np.arange(256) / 255).astype(np.float16)).to(device)
 
 
 class Codec:
@@ -85,7 +85,7 @@ class Codec:
             n_axes += 1
         elif self.names[path] == "image":
             codes = leaf.contiguous().view(torch.int16).int() & 0xFFFF
-            leaf = _to_srgb().to(leaf.device)[codes].movedim(-3, -1)
+            leaf = _to_srgb(leaf.device)[codes].movedim(-3, -1)
         return leaf.squeeze(-n_axes) if space.n_agents == 1 else leaf
 
     def decode(self, path: str, leaf: torch.Tensor, n_axes: int = 1) -> torch.Tensor:
@@ -96,7 +96,7 @@ class Codec:
         if path.startswith("actions") and isinstance(space, spaces.MultiDiscrete):
             return leaf.argmax(-1)
         if self.names[path] == "image":
-            return _to_linear().to(leaf.device)[leaf.long()].movedim(-1, -3)
+            return _to_linear(leaf.device)[leaf.long()].movedim(-1, -3)
         return leaf
 
     def decoded(self, arrays: Mapping[str, np.ndarray]) -> arrdict:

@@ -145,3 +145,10 @@ def test_rollouts_are_the_same_on_a_gpu(env, folder):
             assert torch.equal(getattr(own, name), getattr(other, name).cpu()), name
         for name, leaf in own.obs.items():
             assert torch.equal(leaf, other.obs[name].cpu()), name
+
+
+@pytest.mark.cuda
+def test_it_clones_by_graphs(folder, tmp_path):
+    words = ["learner=bc", f"learner.data={folder}", "learner.lr=1e-2", "samples=12800"]
+    rows = trained(tmp_path, "bc", *words, "device=cuda")
+    assert rows[-1]["loss/policy"] < 0.8
