@@ -37,8 +37,8 @@ from megastep.types import Env, PolicyLike, Tree, optional, takes_masks
 LANES = 1024
 #: Steps that are copied from the device at once.
 STEPS = 64
-#: Threads that write files.
-WRITERS = min(16, os.cpu_count() or 1)
+#: Threads that write files; more would wait for Python's lock.
+WRITERS = min(8, os.cpu_count() or 1)
 #: Folder of the episodes of a dataset in another format, until they are converted.
 STAGED = "episodes"
 

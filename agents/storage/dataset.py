@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from scipy.signal import lfilter
 
 from megastep import spaces
 from megastep.agents.generator import stream_seed
@@ -15,8 +14,8 @@ from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import StateDict
 from megastep.data import Episodes, episodes
 
-#: Threads that read files.
-READERS = 8
+#: Threads that read files; more would wait for Python's lock.
+READERS = 4
 
 
 class DatasetCollector:
@@ -126,8 +125,9 @@ def _read(dataset) -> tuple[dict[str, np.ndarray], list[int]]:
 
 def _returns(reward, lengths, gamma) -> np.ndarray:
     """Returns the discounted sum of the rewards that follow each row of an episode, (R,)."""
-    found, ends = np.zeros_like(reward), np.cumsum(lengths)
-    for end, length in zip(ends, lengths):
-        later = reward[end - length + 1 : end][::-1]
-        found[end - length : end - 1] = lfilter([1.0], [1.0, -gamma], later)[::-1]
+    found, lengths = np.zeros_like(reward), np.array(lengths)
+    firsts = lengths.cumsum() - lengths
+    for t in reversed(range(lengths.max() - 1)):
+        rows = firsts[lengths > t + 1] + t
+        found[rows] = reward[rows + 1] + gamma * found[rows + 1]
     return found

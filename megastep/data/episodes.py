@@ -4,6 +4,7 @@ Row t has the observation at time t, and the action, reward and flags that led t
 Maze's offline set (Pasukonis et al. 2022). Row 0 of these is zeros.
 """
 
+import errno
 import functools
 import io
 import os
@@ -19,6 +20,7 @@ import torch
 
 from megastep import spaces
 from megastep.arrdict import arrdict
+from megastep.atomic_files import delete
 from megastep.colour import gamma_decode, gamma_encode
 
 #: What Memory Maze's offline set calls observations of ours; all others keep their names.
@@ -150,20 +152,29 @@ def _parsed(header) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
+@functools.lru_cache(4096)
+def _packed(dtype, shape, row, n_rows) -> tuple[int, int, bytes]:
+    """Returns checksum, size and deflated bytes of an array that repeats the bytes of a row."""
+    body, packer = _header(dtype, shape) + n_rows * row, zlib.compressobj(1, zlib.DEFLATED, -15)
+    return zlib.crc32(body), len(body), packer.compress(body) + packer.flush()
+
+
 def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Writes an npz file, whole or not at all. Equal arrays give equal bytes. Floor plans are
     compressed. OSError if it cannot be written.
     """
     parts, central, offset = [], [], 0
     for key, array in arrays.items():
-        array, name = np.ascontiguousarray(array), f"{key}.npy".encode()
-        body = [_header(array.dtype, array.shape), array.reshape(-1).view(np.uint8).data]
-        size = n_bytes = sum(map(len, body))
-        crc = zlib.crc32(body[1], zlib.crc32(body[0]))
-        if method := zipfile.ZIP_DEFLATED * (key in PLANS):
-            packer = zlib.compressobj(1, zlib.DEFLATED, -15)
-            body = [b"".join([packer.compress(body[0]), packer.compress(body[1]), packer.flush()])]
-            n_bytes = len(body[0])
+        name, method = f"{key}.npy".encode(), 0
+        if key in PLANS:
+            rows = array if array.strides[0] else array[:1]
+            about = array.dtype, array.shape, rows.tobytes(), len(array) // len(rows)
+            (crc, size, *body), method = _packed(*about), zipfile.ZIP_DEFLATED
+        else:
+            array = np.ascontiguousarray(array)
+            body = [_header(array.dtype, array.shape), array.reshape(-1).view(np.uint8).data]
+            crc, size = zlib.crc32(body[1], zlib.crc32(body[0])), sum(map(len, body))
+        n_bytes = sum(map(len, body))
         about = 20, 0, method, 0, _DATE, crc, n_bytes, size, len(name), 0
         local = struct.pack(_LOCAL, b"PK\3\4", *about) + name
         attributes = 0, 0, 0, 0o600 << 16, offset
@@ -172,13 +183,17 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         offset += len(local) + n_bytes
     directory, n = b"".join(central), len(central)
     parts += [directory, struct.pack(_END, b"PK\5\6", 0, 0, n, n, len(directory), offset, 0)]
-    temporary = path.with_suffix(".tmp")
+    temporary = f"{path}.tmp"
     try:
-        with open(temporary, "wb") as file:
-            file.writelines(parts)  # without joining them, which would block other threads
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        try:  # at once, as threads wait for one another between calls
+            if os.writev(handle, parts) < sum(map(len, parts)):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        finally:
+            os.close(handle)
         os.replace(temporary, path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        delete(Path(temporary))
         raise
 
 
