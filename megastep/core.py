@@ -67,9 +67,7 @@ class Core:
         return torch.full((self.n_envs,), value, device=self.device)
 
     def alone(self, e: int) -> "Core":
-        """Returns a copy of environment ``e`` as the only one of a core, whose layouts are shared
-        with this one. Takes the same time however many environments there are.
-        """
+        """Returns a copy of environment ``e`` as the only one of a core that shares its layouts."""
         shared = self.scenery
         widths, layout = shared.model_texels.diff(), shared.layout[[e]]
         scenery = engine.Scenery(self.n_agents, shared.layouts, shared.model, widths, layout)

@@ -62,9 +62,7 @@ def centers(indices: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.
 
 
 def indices(coords: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.ndarray:
-    """Returns the cells of points: (i, j), (..., 2) int64, for (x, y) in metres, (..., 2). Points
-    outside the masks give indices outside `shape`.
-    """
+    """Returns cells (i, j), (..., 2) int64, of points (x, y) in metres, also outside `shape`."""
     cells = np.floor(np.asarray(coords, np.float64) / res).astype(np.int64)
     return np.stack([shape[0] - 1 - cells[..., 1], cells[..., 0]], -1)
 
@@ -242,9 +240,7 @@ def contents(geometries: Sequence[dotdict]) -> Iterator[np.ndarray]:
 
 
 def display(g: dotdict, ax: "Axes | None" = None) -> "Axes":
-    """Draws the floor plan of a geometry: rooms tinted, walls black, lights yellow. Returns the
-    matplotlib axes.
-    """
+    """Draws a geometry: rooms tinted, walls black, lights yellow. Returns the matplotlib axes."""
     from matplotlib import collections, pyplot
 
     ax = pyplot.subplots(figsize=(6, 6))[1] if ax is None else ax
@@ -262,9 +258,7 @@ def display(g: dotdict, ax: "Axes | None" = None) -> "Axes":
 
 
 def components(free: np.ndarray) -> tuple[np.ndarray, int]:
-    """Returns the 4-connected components of cells, (H, W) bool: labels (H, W), 0 where not free,
-    and their number.
-    """
+    """Returns labels (H, W) of 4-connected components of free cells, else 0, and their number."""
     from scipy import ndimage  # which takes a while to import
 
     labels, count = ndimage.label(free)  # pyright: ignore[reportGeneralTypeIssues]

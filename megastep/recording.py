@@ -122,9 +122,7 @@ class ParallelEncoder:
                 raise
 
     def save(self, path: str | os.PathLike) -> Film:
-        """Writes the video to ``path``, an mp4 or GIF as ``format`` says, and returns the path. If
-        it fails, an existing file is unchanged.
-        """
+        """Writes the video, and returns its path. If it fails, an existing file is unchanged."""
         video, path = self._finished(), Film(path)
         if path.suffix != f".{self._format}":
             raise ValueError(
@@ -300,9 +298,7 @@ def _picture(players, moments) -> plotting.Picture:
 
 
 def film_moments(player: Player, steps: int, greedy, seed, trail) -> Iterator[tuple[Tree, str]]:
-    """Plays for some steps from a reset. Yields before each a numpyified state, and a note of the
-    returns so far.
-    """
+    """Plays from a reset. Yields before each step a numpyified state, a note of returns."""
     env, policy = cast(Any, player.env), player.policy
     n_agents, generator = optional(env, "n_agents"), torch.Generator(env.device).manual_seed(seed)
     returns = np.zeros(n_agents, np.float32)

@@ -52,9 +52,7 @@ def texel_widths(lines: np.ndarray) -> np.ndarray:
 
 
 def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
-    """Returns the lines, (8, 2, 2), of an octagon in a square of ``width`` metres. The third is its
-    front (+x).
-    """
+    """Returns the lines, (8, 2, 2), of an octagon ``width`` metres wide. The third is its front."""
     w, h = width / 2, width / 4
     corners = np.array(
         [(-h, -w), (h, -w), (w, -h), (w, h), (h, w), (-h, w), (-w, h), (-w, -h)], dtype=np.float32
@@ -73,9 +71,7 @@ def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Returns the texels, (T, 3), of walls with ``widths``, (W,), texels each: stripes of two
-    colours with a random period, phase and duty cycle.
-    """
+    """Returns texels (T, 3) of walls of ``widths`` (W,) texels: random stripes of two colours."""
     n, palette = len(widths), WALL_COLOURS
     base = palette[random.integers(len(palette), size=n)] * random.uniform(0.6, 1.0, (n, 1))
     stripe = palette[random.integers(len(palette), size=n)] * random.uniform(0.2, 0.8, (n, 1))
@@ -129,9 +125,7 @@ def _first_layouts(n_envs, n_layouts) -> torch.Tensor:
 
 
 def spread(geometries: Sequence, n_envs: int) -> list:
-    """Returns the geometries that ``n_envs`` environments start in, each once, in order: all of
-    them, or ``n_envs`` evenly spaced ones if there are more.
-    """
+    """Returns the geometries that ``n_envs`` environments start in: all, or evenly spaced ones."""
     n_envs = checks.integer("n_envs", n_envs, 1)
     n_geometries = len(checks.items("geometries", geometries))
     indices = _first_layouts(min(n_envs, n_geometries), n_geometries).tolist()
@@ -193,9 +187,7 @@ def scenery(
 
 
 def display(scenery: Scenery, e: int = 0, ax: "Area | Axes | None" = None) -> "Area | Axes":
-    """Draws environment ``e`` in its lit colours, with its lights and agents. Returns what it is
-    drawn on.
-    """
+    """Draws environment ``e`` in its lit colours. Returns what it is drawn on."""
     from megastep import plotting
 
     lines, colours, lights = scenery.env(e)

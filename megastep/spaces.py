@@ -218,9 +218,7 @@ def are_actions(space: MultiDiscrete | MultiContinuous, values: torch.Tensor) ->
 
 
 def leaves(space: object, name: str = "") -> dict[str, Any]:
-    """Returns the leaves of a tree of spaces, observations or others by dotted path, such as
-    ``{"obs.rgb": MultiImage(...)}``. A tree that is no dict is the one leaf of the path ``name``.
-    """
+    """Returns the leaves of a tree of spaces by dotted path, or {``name``: the tree}."""
     if not isinstance(space, Mapping):
         return {name: space}
     paths = {}

@@ -71,9 +71,7 @@ class BC(learner.GradientLearner):
         self.source: DatasetCollector | None = None
 
     def collector(self, env: Env, values: bool = False) -> CollectorLike:
-        """Returns a collector of rollouts of the dataset's episodes. ValueError naming the space
-        that differs from the environment's.
-        """
+        """Returns a collector of the dataset's episodes. ValueError names a space that differs."""
         tree = {"obs": env.obs_space, "actions": env.action_space}
         own = {name: repr(space) for name, space in spaces.leaves(tree).items()}
         stored = self.dataset.about["spaces"]

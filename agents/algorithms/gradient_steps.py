@@ -153,9 +153,7 @@ class GradientSteps:
         return is_taken
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Ends the update. Returns the means of the metrics over the steps taken, NaN without one,
-        and `skipped_steps`, the number of steps skipped because they were not finite.
-        """
+        """Ends the update. Returns the metrics' means over the steps taken, and `skipped_steps`."""
         assert self.totals is not None
         n_taken, n_skipped = self.totals[-2], self.totals[-1]
         self.check.count((n_taken == 0) & (n_skipped > 0))

@@ -78,9 +78,7 @@ class Adam(_Optimizer):
         self.squares = [torch.zeros_like(p) for p in self.parameters]
 
     def rows(self) -> Iterator[tuple[float, float, list[tuple[torch.Tensor, ...]]]]:
-        """Yields factor and weight decay of each group, and of its parameters with a gradient the
-        parameter, gradient and running means.
-        """
+        """Yields each group's factor, weight decay, and (parameter, gradient, running means)."""
         moments = dict(zip(self.parameters, zip(self.means, self.squares), strict=True))
         for (factor, weight_decay), members in self.groups.items():
             rows = [(p, p.grad, *moments[p]) for p in members if p.grad is not None]

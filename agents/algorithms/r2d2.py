@@ -176,9 +176,7 @@ class EpsilonGreedy:
 
 
 def epsilons(n_lanes: int, epsilon: float, spread: float) -> torch.Tensor:
-    """Returns epsilon ** (1 + spread i / (B - 1)) for lane i, (B,) from `epsilon` to almost greedy
-    (Ape-X, Horgan et al. 2018, section 4).
-    """
+    """Returns epsilon ** (1 + spread i / (B - 1)) for lane i, (B,) (Horgan et al. 2018)."""
     return epsilon ** (1 + spread * torch.linspace(0, 1, n_lanes))
 
 
@@ -276,9 +274,7 @@ class R2D2(learner.GradientLearner):
         return self.replay_settings.ratio / self.gradient_steps * (self.length + 1)
 
     def replay_size(self, env: Env) -> tuple[int, float]:
-        """Returns the number of observations that the replay buffer will hold, and the bytes per
-        observation.
-        """
+        """Returns how many observations the replay buffer will hold, and the bytes of each."""
         settings = self.replay_settings
         return replay_size(env, self.policy, self.n_steps, settings, logprobs=False)
 

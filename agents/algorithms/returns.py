@@ -170,9 +170,7 @@ def n_step_returns(
 
 
 def rescale(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
-    """Returns h(x) = sign(x) (sqrt(|x| + 1) - 1) + eps x, which compresses large returns (value
-    rescaling, Pohlen et al. 2018).
-    """
+    """Returns h(x) = sign(x) (sqrt(|x| + 1) - 1) + eps x (value rescaling, Pohlen et al. 2018)."""
     return x.sign() * ((x.abs() + 1).sqrt() - 1) + eps * x
 
 

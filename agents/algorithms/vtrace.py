@@ -102,9 +102,7 @@ class VTrace(learner.ActorCritic):
         return (1 + ratio) * super().minibatch_rows()
 
     def replay_size(self, env: Env) -> tuple[int, float]:
-        """Returns the number of observations that the replay buffer will hold, and the bytes per
-        observation; zeros without a replay buffer.
-        """
+        """Returns how many observations the replay buffer holds, and bytes of each, or zeros."""
         if self.replay_settings is None:
             return 0, 0.0
         return replay_size(env, self.policy, self.n_steps, self.replay_settings)

@@ -53,9 +53,7 @@ class Budget:
         return min(_fraction_left(samples, self.samples), seconds_left)
 
     def lr_fraction(self, updates: int, samples: int, seconds: float) -> float:
-        """Returns the fraction of the budget that is left for the next update, from 1 to 0: the
-        factor of the learning rate if it is annealed, and what schedules follow.
-        """
+        """Returns the fraction of the budget that is left for the next update, from 1 to 0."""
         if updates < len(self.recorded):
             return self.recorded[updates]
         if self.anneal == "samples" or (self.anneal == "never" and self.samples is not None):

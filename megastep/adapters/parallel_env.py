@@ -65,9 +65,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
         return self._rows(obs), self._masks(infos)
 
     def step(self, actions: Mapping[str, Tree]) -> tuple[dict, dict, dict, dict, dict]:
-        """Steps all agents. Returns (observations, rewards, terminations, truncations, infos) by
-        agent, empty dicts once the game is over.
-        """
+        """Steps all agents. Returns the usual five dicts by agent, empty once the game is over."""
         if not self.agents:
             return {}, {}, {}, {}, {}
         chosen = arrdict.stack([actions[agent] for agent in self.possible_agents])

@@ -42,9 +42,7 @@ class SB3VecEnv(VecEnv):
         self.metadata["render_fps"] = self.fps
 
     def reset(self) -> Tree:
-        """Begins episodes in all lanes, with the seeds of ``seed``, if it was called. Returns
-        observations.
-        """
+        """Begins episodes in all lanes, with the seeds of ``seed``. Returns observations."""
         seeds = [*self._seeds]
         obs, self._infos = self.vector.reset(seed=None if None in seeds else seeds)
         self._reset_seeds()
@@ -98,9 +96,7 @@ class SB3VecEnv(VecEnv):
         indices: int | Iterable[int] | None = None,
         **kwargs: object,
     ) -> list:
-        """Calls a method of the environment once. Returns its result, once per lane; of
-        ``action_masks`` each lane's own, (n,) bool.
-        """
+        """Returns a method's result per lane; of ``action_masks`` each lane's own, (n,) bool."""
         if method_name == ACTION_MASKS:
             if "action_mask" not in self._infos:
                 raise AttributeError(f"{type(self.env).__name__} masks no actions, or is not reset")
@@ -116,9 +112,7 @@ class SB3VecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Returns a drawing (H, W, 3) uint8 of each environment if ``render_mode`` is
-        ``rgb_array``; otherwise None for each lane.
-        """
+        """Returns a drawing (H, W, 3) uint8 of each lane with ``rgb_array``, otherwise None."""
         return self.vector.render() or [None] * self.num_envs
 
     @property

@@ -182,9 +182,7 @@ class Scenery(SetOnce):
 
     @property
     def textures(self) -> RaggedTorch:
-        """The texels (w, 3) of each line of all environments, of line l of environment e at index
-        ``lines.starts[e] + l``. Read-only.
-        """
+        """The texels (w, 3) of lines; l of environment e at ``lines.starts[e] + l``. Read-only."""
         cure = "; agents' are in scenery.layouts.agent_textures"
         return self._joined("textures", cure, lambda part: (part.texels[:, :3], part.widths))
 

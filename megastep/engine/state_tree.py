@@ -118,9 +118,7 @@ def is_expanded(leaf: object) -> bool:
 
 @torch.no_grad()
 def restore(env: object, saved: State) -> None:
-    """Writes a :func:`snapshot` back, in place. ValueError naming the first leaf that is missing or
-    differs in shape or dtype.
-    """
+    """Writes a :func:`snapshot` back, in place. ValueError names the first leaf that differs."""
     tree = state_tree(env)
     missing = sorted(saved.keys() - tree.keys())
     if missing:

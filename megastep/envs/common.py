@@ -72,9 +72,7 @@ def judged(
 
 
 def world_of(outputs: Mapping, obs: Any, metrics: Sequence[str], **critic: str) -> arrdict:
-    """Returns the world of a step's outputs, with names of its metrics, and of what a critic sees:
-    {name: its output}.
-    """
+    """Returns the world of a step's outputs, names of its metrics, and a critic's inputs."""
     world = arrdict(obs=obs, **{name: outputs[name] for name in ("reward", *FLAGS)})
     if outputs["metrics"] is not None:
         world["metrics"] = arrdict(zip(metrics, outputs["metrics"].unbind()))
@@ -118,9 +116,7 @@ class SceneryEnv(DisplayedEnv):
     spawner: RandomSpawns
 
     def check(self) -> None:
-        """Raises EngineError if the engine flagged an error on the device since the last check.
-        Synchronises host and device, so do not call it from ``step``.
-        """
+        """Raises EngineError if an error was flagged on the device, for which it waits."""
         engine.check(self.core.agents)
 
     @property

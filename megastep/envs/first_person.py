@@ -24,9 +24,7 @@ __all__ = ["FirstPerson", "images"]
 
 
 def images(view: engine.Observation) -> arrdict:
-    """Returns ``rgb`` (B, 1, 3, C, P), ``d`` (B, 1, 1, C, P) and ``imu`` (B, 1, 3) as views of an
-    observation's tensors: an image has a row per camera.
-    """
+    """Returns ``rgb`` (B, 1, 3, C, P), ``d`` (B, 1, 1, C, P), ``imu`` (B, 1, 3); C cameras."""
     rgb, d = view.rgb, view.depth
     assert rgb is not None and d is not None and view.imu is not None
     lanes, pixels = (d.shape[0] * d.shape[1], 1), d.shape[-1]

@@ -109,9 +109,7 @@ class Minimal(SceneryEnv):
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
-        """Draws a numpyified :meth:`state`: the floor plan above the agent's image. Returns a
-        matplotlib figure.
-        """
+        """Draws a numpyified :meth:`state`: the floor plan above the agent's image."""
         lifecycle = state.lifecycle
         title = f"step {lifecycle.age[0]} of {lifecycle.limit[0]}"
         figure, plan, strips = plotting.panels(1, title=title)

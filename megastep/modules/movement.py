@@ -19,9 +19,7 @@ CONTROLS = [3, 1, 5]  # the actions that a continuous action weights: forward, l
 
 
 def to_lanes(values: torch.Tensor) -> torch.Tensor:
-    """Returns (N, A, ...) as lanes (B, ...), a view if possible: lane e A + a is agent a of
-    environment e.
-    """
+    """Returns (N, A, ...) as lanes (B, ...): lane e A + a is agent a of environment e."""
     return values.flatten(0, 1)
 
 
@@ -31,9 +29,7 @@ def to_agents(values: torch.Tensor, n_agents: int) -> torch.Tensor:
 
 
 def to_global(angles: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """Rotates vectors (..., 2) from the frames of agents that head along ``angles`` (...), in
-    degrees, into the global frame.
-    """
+    """Rotates vectors (..., 2) from frames of headings ``angles`` (...), degrees, to the global."""
     radians = torch.deg2rad(angles)
     s, c = radians.sin(), radians.cos()
     x, y = vectors[..., 0], vectors[..., 1]

@@ -26,9 +26,7 @@ def render(core: Core) -> engine.Render:
 
 
 def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
-    """Groups neighbouring rays, (..., R) to (..., R / subsample, subsample), for a mean or minimum
-    over the last axis. ValueError if ``subsample`` does not divide R.
-    """
+    """Groups rays, (..., R) to (..., R / subsample, subsample). ValueError unless it divides R."""
     n_rays = screen.shape[-1]
     if n_rays % checks.integer("subsample", subsample, 1):
         raise ValueError(f"subsample={subsample} does not divide the {n_rays} rays of the screen")

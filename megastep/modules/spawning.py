@@ -27,9 +27,7 @@ BATCHES = 20  # of candidate points; then the search ends
 
 
 def distances(points, walls) -> np.ndarray:
-    """Returns the metres, (P,) float64, from points (P, 2) to the nearest of walls (M, 2, 2);
-    infinite without walls.
-    """
+    """Returns metres, (P,) float64, from points (P, 2) to the nearest wall (M, 2, 2), or inf."""
     (ax, ay), (vx, vy) = walls[:, 0].T, (walls[:, 1] - walls[:, 0]).T
     dx, dy = points[:, :1] - ax, points[:, 1:] - ay
     along = (dx * vx + dy * vy) / np.maximum(vx * vx + vy * vy, 1e-12)
@@ -181,9 +179,7 @@ class RandomSpawns:
 def cached_points(
     geometries: Sequence[dotdict], n: int, n_agents: int, radius: float, seed: int
 ) -> np.ndarray:
-    """Returns the :func:`spawn_points` of every layout, (D, n_agents * (n // n_agents), 2) float32,
-    for many layouts by the cache.
-    """
+    """Returns the :func:`spawn_points` of layouts, (D, n_agents * (n // n_agents), 2) float32."""
 
     def build() -> dict[str, np.ndarray]:
         generators = (np.random.Generator(np.random.Philox([seed, d])) for d in itertools.count())

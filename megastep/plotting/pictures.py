@@ -82,9 +82,7 @@ class Area(Artist):
         self.set_figure(figure)
 
     def fit(self, low: np.ndarray, high: np.ndarray, foot: float = 0.0) -> None:
-        """Makes points data coordinates: those from ``low`` to ``high``, (2,) each, are shown,
-        above a ``foot`` in inches.
-        """
+        """Shows points from ``low`` to ``high``, (2,) each, as data, above a ``foot``, inches."""
         if self.axes is not None:
             self.axes.set_aspect("equal", adjustable="datalim")
             self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
@@ -270,9 +268,7 @@ def panels(
 
 
 def captioned(image: np.ndarray) -> np.ndarray:
-    """Returns an image, (H, W, 3) uint8, below the title and the note of the style. Images of few
-    pixels are enlarged towards 720 lines.
-    """
+    """Returns an image (H, W, 3) uint8 below title and note; a small one is enlarged."""
     style = current()
     scale = max(round(100 * (HEIGHT - HEAD)) // len(image), 1)
     height, width = (scale * size / 100 for size in image.shape[:2])

@@ -189,9 +189,7 @@ def texel_segments(lines: ArrayLike, widths: ArrayLike) -> np.ndarray:
 
 
 def wall_colours(texels: ArrayLike, least: float = 0.5, greatest: float = 1.0) -> np.ndarray:
-    """Returns the sRGB colours of lit texels (T, 3): their hue in full, and a brightness between
-    ``least`` and ``greatest`` that shows the light and the texture.
-    """
+    """Returns sRGB colours of lit texels (T, 3): full hue, brightness ``least`` to ``greatest``."""
     texels = np.clip(np.asarray(texels, np.float32).reshape(-1, 3), 0, None)
     peak = texels.max(1, keepdims=True, initial=0)
     hue = gamma_encode(texels / np.maximum(peak, 1e-6))

@@ -124,9 +124,7 @@ class NoisyActions(_Random):
 
 
 def normal(numbers: torch.Tensor) -> torch.Tensor:
-    """Returns numbers of mean 0 and standard deviation 1 from four uniform ones each, (..., 4) ->
-    (...): their sum, which is nearly Gaussian, and has the same bits on CPU and GPU.
-    """
+    """Returns nearly Gaussian numbers from four uniform ones each, (..., 4) -> (...)."""
     a, b, c, d = numbers.unbind(-1)
     return ((a + b) + (c + d) - 2.0) * 3**0.5
 

@@ -74,9 +74,7 @@ class Wrapper:
         return self._resets.keep(self.after(cast(arrdict, world)))
 
     def restarted(self, mask: torch.Tensor) -> arrdict:
-        """Returns the last world of the environment inside, in which the lanes of a mask (B,) have
-        begun new episodes.
-        """
+        """Returns the last world inside, in which lanes of a mask (B,) have begun new episodes."""
         reset: Callable = self.env.reset
         return reset(mask=mask)
 

@@ -208,9 +208,7 @@ class Deathmatch(FirstPerson):
         return self._resets.keep(self._world())
 
     def _world(self, **rules) -> arrdict:
-        """Respawns agents whose episode has ended, renders, and lets the agents hit each other, by
-        other ``rules`` than usual if given.
-        """
+        """Respawns agents whose episode has ended, renders, and lets the agents hit each other."""
         self.spawner(self.ended)
         search = {}
         if self.seen is not None:  # counts newly seen texels
@@ -282,9 +280,7 @@ class Deathmatch(FirstPerson):
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
-        """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
-        each agent to its target, and each agent's health, RGB and depth.
-        """
+        """Draws a numpyified :meth:`state`: floor plan, targets, health, RGB and depth."""
         title = f"step {state.age.max()} · kills {state.kills.sum():.3g}"
         agents = range(len(state.health))
         figure, plan, strips = plotting.panels(4 * -(-len(agents) // 2), title=title, columns=2)

@@ -48,9 +48,7 @@ NO_RUNS = TexelRuns()
 
 
 def texel_runs(scenery: Scenery, visible: torch.Tensor) -> TexelRuns:
-    """Returns the runs of ``visible``, (D, n_words) int32, the texels that
-    :func:`~megastep.modules.visible_texels` returns for the D layouts of a scenery.
-    """
+    """Returns the runs of ``visible``, (D, n_words) int32, see ``modules.visible_texels``."""
     layouts, device = scenery.layouts, scenery.device
     wall_starts, texel_starts = layouts.wall_starts.long().cpu(), layouts.texel_starts.cpu()
     visible, lines = visible.cpu(), layouts.lines.vals.cpu()
@@ -189,8 +187,6 @@ class Explorer(FirstPerson):
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
-        """Draws a numpyified :meth:`state`: the floor plan, where walls that were not seen are
-        grey, above the agent's images. Returns a matplotlib figure.
-        """
+        """Draws a numpyified :meth:`state`: the floor plan, unseen walls grey, above the images."""
         coverage = (state.seen & state.visible).sum() / max(state.visible.sum(), 1)
         return cls._draw(state, f"step {state.age} · {100 * coverage:.0f} % seen", seen=state.seen)

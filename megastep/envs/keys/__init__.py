@@ -149,9 +149,7 @@ class Keys(FirstPerson):
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
-        """Draws a numpyified :meth:`state` as a matplotlib figure: the home with shut doors, keys
-        and the goal in a ring, and the agent's RGB and depth.
-        """
+        """Draws a numpyified :meth:`state`: shut doors, keys, the goal in a ring, RGB and depth."""
         carried = [name for name, has in zip(modules.COLOURS, state.carried) if has]
         doors = "door" if state.opened == 1 else "doors"
         title = f"step {state.age} · {state.opened} {doors} opened"

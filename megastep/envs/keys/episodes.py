@@ -77,9 +77,7 @@ def cached_episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed:
 
 
 def episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:
-    """Returns n random episodes of each geometry, with up to `n_colours` shut doors. ValueError if
-    no geometry has a doorway between two of its areas, or one has no room.
-    """
+    """Returns n episodes of each geometry. ValueError: no doorway between areas, or no room."""
     n_doors = max(len(doors_of(g)) for g in geometries)
     found = per_geometry(
         geometries, seed, lambda g, random: _episodes(g, n, n_colours, n_doors, random)

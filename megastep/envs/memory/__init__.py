@@ -182,9 +182,7 @@ class Memory(FirstPerson):
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
-        """Draws a numpyified :meth:`state` as a matplotlib figure: the maze with the object to find
-        in a ring, and the agent's RGB and depth.
-        """
+        """Draws a numpyified :meth:`state`: maze, the object to find in a ring, RGB and depth."""
         colour = [*modules.COLOURS][int(state.cue)]
         title = f"step {state.age} · {state.found} found · to find: {colour}"
         return cls._draw(state, title, (state.goal, 1.5 * RADIUS))

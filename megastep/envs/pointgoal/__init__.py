@@ -162,9 +162,7 @@ class PointGoal(FirstPerson):
         return self._with_target(super().truth(), goals)
 
     def describe(self) -> dict:
-        """Returns what the numbers of a robot's observations and actions mean, for programs that
-        drive one with an exported policy. Empty without a robot.
-        """
+        """Returns what a robot's observations and actions mean, for programs around its policy."""
         if self.robot is None:
             return {}
         robot, limits = dataclasses.asdict(self.robot), [self.robot.speed, self.robot.turn_rate]
@@ -201,9 +199,7 @@ class PointGoal(FirstPerson):
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
-        """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan with the goal,
-        and the agent's RGB and depth.
-        """
+        """Draws a numpyified :meth:`state`: the floor plan with the goal, RGB and depth."""
         title = (
             f"step {state.age} · {state.distance:.1f} of {state.shortest:.1f} m to go"
             f" · {state.walked:.1f} m walked"

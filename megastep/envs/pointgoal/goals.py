@@ -51,9 +51,7 @@ class GoalFields(NamedTuple):
 def packed(
     layouts: Sequence[Geodesics], allowed: Sequence[np.ndarray], device: torch.device
 ) -> GoalFields:
-    """Returns the goals of layouts, of which (S, G) bool each may be drawn; at least one per spawn
-    point.
-    """
+    """Returns the goals of layouts; (S, G) bool may be drawn, at least one per spawn point."""
     fields = [layout.fields for layout in layouts]
     points, origins, lengths = (
         np.stack([getattr(layout, name) for layout in layouts])
@@ -113,9 +111,7 @@ def goal_fields(
 
 
 def check_doors(geometries: Sequence[dotdict], radius: float) -> None:
-    """Raises ValueError, naming the geometry, if a robot of a radius fits through none of the doors
-    and openings of a home, where these are known.
-    """
+    """Raises ValueError if a robot of a radius fits through none of a home's known openings."""
     for g in {id(g): g for g in geometries}.values():
         gaps = np.concatenate([g.get(name, np.empty((0, 2, 2))) for name in ("doors", "openings")])
         widths = np.linalg.norm(gaps[:, 1] - gaps[:, 0], axis=1)
@@ -136,9 +132,7 @@ def _in_range(layout, nearest, furthest) -> np.ndarray:
 def all_geodesics(
     geometries: Sequence[dotdict], radius: float, seed: int, device: torch.device | str = "cpu"
 ) -> list[Geodesics]:
-    """Returns the geodesics of each geometry, the same on any device. A GPU computes them in less
-    time than a file takes to read; a CPU takes some seconds for 512 homes, and caches them.
-    """
+    """Returns the geodesics of each geometry, the same on any device; a CPU caches them."""
     distinct = list({id(g): g for g in geometries}.values())
     generators = [np.random.Generator(np.random.Philox([seed, d])) for d in range(len(distinct))]
     found = geodesics.geodesics(distinct, N_SPAWNS, N_GOALS, radius, generators, device)
