@@ -217,6 +217,29 @@ def test_agents_are_at_least_12_pixels_wide_in_their_colour():
     assert ((across[:, 0] > 200) & (across[:, 1] < 60)).sum() >= 12
 
 
+def test_teams_outline_what_they_have_locked_and_hold_it_on_a_line():
+    room = toys.box()
+    c = core.Core(scene.scenery([room], 2, 1, device="cpu"))
+    crate = modules.Crate(1, side=1.0, movable=True)
+    crates = modules.Objects([room], c, {"a": crate, "b": crate}, colours=["ffffff"])
+    c.agents.positions[:] = torch.tensor([[3.0, 2.0], [3.0, 5.0]])
+    for name, x in (("a", 2.0), ("b", 5.0)):
+        crates[name].positions[:] = torch.tensor([x, 4.0])
+        crates[name].visible[:] = True
+    crates["a"].lock(torch.ones(1, 1, dtype=torch.bool), 7)
+    crates["b"].grab(torch.tensor([[[True], [False]]]))
+    state = numpyify(c.state(0))
+    state["teams"] = np.array([2, 0])
+    figure, plan, _ = plotting.panels()
+    core.Core.plot_state(state, plan)
+    image = plotting.rasterise(figure)
+    for colour, point in ((7, (1.5, 4.2)), (2, (4.0, 3.0)), (2, (4.8, 3.8))):
+        expected = [int(plotting.AGENTS[colour][i : i + 2], 16) for i in (1, 3, 5)]
+        column, row = plan.transform.transform(point).astype(int)
+        near = image[len(image) - 4 - row : len(image) + 3 - row, column - 3 : column + 4]
+        assert (np.abs(near - np.array(expected)).max(-1) < 8).any(), (colour, point)
+
+
 # ---- Figures ----
 
 

@@ -8,6 +8,7 @@ Prints a row for each hider and seeker, with 95 % intervals over rooms. Players 
 """
 
 import argparse
+import itertools
 import math
 import os
 import sys
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from megastep.agents.errors import UserError
 from megastep.agents.evaluation import eval_env, playing, statistics
 from megastep.agents.evaluation.eval_env import EvalEnv, Player
 from megastep.agents.factory import make as factory
@@ -218,13 +220,22 @@ def main(argv=None) -> None:
     parser.add_argument("--frozen", action="store_true", help="nobody can move a body")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--device", default="auto")
-    args = parser.parse_args(argv)
+    try:
+        compare(parser.parse_args(argv))
+    except UserError as error:
+        parser.error(str(error))
+
+
+def compare(args: argparse.Namespace) -> None:
+    """Prints the table that the words ask for."""
     runs = [n for n in args.hiders + args.seekers if n != UNTRAINED and not eval_env.is_bot(n)]
     if not runs:
-        parser.error("one of --hiders and --seekers must be a run, which says what is played")
+        raise UserError("one of --hiders and --seekers must be a run, which says what is played")
     device = factory.make_device(args.device)
     run = folders.load_checkpoint(folders.find(runs[0]), False, device)
     trained = factory.config_of(run)
+    if not hasattr(trained.env, "n_hiders"):
+        raise UserError(f"{runs[0]} was trained in {trained.env.name}, which is not hide and seek")
     env_settings = settings.changed(trained.env, movable=not args.frozen, resample=False)
     geometry = settings.changed(trained.geometry, n=args.episodes)
     homes = factory.homes(env_settings, geometry, "test")
@@ -239,11 +250,11 @@ def main(argv=None) -> None:
             return where.players([name], run, False)[0]
         return Player(name, factory.make_policy(trained.agent, where.env, args.seed))
 
-    for hider in args.hiders:
-        for seeker in args.seekers:
-            players = where.begin(run, player(hider), player(seeker))
-            cells = row_of(measure(where.env, *players, seed=args.seed))
-            print("| " + " | ".join([hider, seeker, *cells]) + " |", flush=True)
+    players = {name: player(name) for name in dict.fromkeys(args.hiders + args.seekers)}
+    for hider, seeker in itertools.product(args.hiders, args.seekers):
+        policies = where.begin(run, players[hider], players[seeker])
+        cells = row_of(measure(where.env, *policies, seed=args.seed))
+        print("| " + " | ".join([hider, seeker, *cells]) + " |", flush=True)
 
 
 if __name__ == "__main__":

@@ -118,3 +118,6 @@ def test_a_table_of_runs_and_bots(tmp_path, monkeypatch, capsys):
             hidden, seen, moved, *_ = (float(cell.split()[0]) for cell in row.split("|")[3:7])
             assert hidden + seen == pytest.approx(1, abs=2e-3)
             assert moved == 0 or not frozen
+    with pytest.raises(SystemExit, match="2"):
+        hide_and_seek.main(["--hiders", "memory_9", "--seekers", "random", "--device", "cpu"])
+    assert "which is not hide and seek" in capsys.readouterr().err
