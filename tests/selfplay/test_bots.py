@@ -17,7 +17,7 @@ from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.bots.plans import Plans
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.agents.selfplay.bots.seekers import Mapper, Oracle, Wanderer
-from megastep.agents.selfplay.bots.walker import Explorer, Hunter, Walker
+from megastep.agents.selfplay.bots.walker import Explorer, Hunter, Runner, Walker
 from megastep.arrdict import arrdict
 from megastep.geometries import sample
 from megastep.modules.spawning import distances
@@ -110,9 +110,10 @@ def test_hunter_wins_duels():
 
 
 def test_bots_play_alike_in_some_lanes(device):
-    env = envs.Deathmatch(6, DENSE, n_agents=3, device=device)
+    deathmatch = envs.Deathmatch(6, DENSE, n_agents=3, device=device)
+    hide_and_seek = envs.HideAndSeek(5, device=device, prep=10)
     lanes = torch.tensor([17, 0, 4, 9], device=device)
-    for kind in (Explorer, Hunter):
+    for kind, env in ((Explorer, deathmatch), (Hunter, deathmatch), (Runner, hide_and_seek)):
         bot = kind(env)
         decision, state, world = play(env, bot, 20)
         all_decided, _ = bot(world, state)
@@ -122,9 +123,10 @@ def test_bots_play_alike_in_some_lanes(device):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("kind", [Explorer, Hunter, Walker])
+@pytest.mark.parametrize("kind", [Explorer, Hunter, Walker, Runner])
 def test_bots_never_synchronise(kind):
     env = envs.Deathmatch(64, DENSE, n_agents=2, device="cuda")
+    env = envs.HideAndSeek(32, device="cuda") if kind is Runner else env
     bot, world = kind(env), env.reset()
     state = bot.initial(128, env.device)
     decision, state = bot(world, state)
@@ -144,6 +146,7 @@ PONG = envs.Pong(2, self_play=True, device="cpu")
         *((n, PONG, f"{n} cannot play in Pong.*Pong has no core") for n in BOTS if n != "random"),
         ("hunter", envs.PointGoal(1, HOMES[:1], device="cpu"), "hunts others by the observation d"),
         ("explorer", Matrix(2), "explorer cannot play in Matrix"),
+        ("runner", envs.Deathmatch(1, HOMES[:1], device="cpu"), "is_hider says who runs"),
         ("oracle", envs.PointGoal(1, HOMES[:1], device="cpu"), "PointGoal has no cue"),
         ("hunted", PONG, "hunted"),
     ],
