@@ -56,7 +56,7 @@ struct Bodies {
     float load[MAX_BODIES], load_turn[MAX_BODIES];  // their sums over all substeps
     float extent[MAX_SLOTS], speeds[MAX_SLOTS];
     signed char exists[MAX_SLOTS], holders[MAX_SLOTS], hit[MAX_SLOTS];
-    signed char awake[MAX_SLOTS], overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
+    signed char overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
     signed char elevated[MAX_SLOTS];  // of agents, as in ObjectsParams, but 1 for all above 0
     int candidates[MAX_CANDIDATES];
     signed char touch_a[MAX_TOUCHES], touch_b[MAX_TOUCHES], levels[MAX_TOUCHES];
@@ -253,24 +253,22 @@ HD int may_touch(const Bodies& b, int a, int c, float reach) {
 // reach, nor what that may push.
 template <class Group>
 HD void leave_out_sleepers(const Group& group, Bodies& b, int n_slots, float reach) {
+    unsigned int awake = 0;  // a bit for each slot
     for (int i = group.rank; i < n_slots; i += Group::SIZE)
-        b.awake[i] = b.speeds[i] > 0.f;
-    sync(group);
-    for (unsigned int any = 1; any;) {
-        any = 0;
+        awake |= (b.speeds[i] > 0.f ? 1u : 0u) << i;
+    awake = reduce_or(group, awake);
+    for (unsigned int woken = awake; woken; awake |= woken) {
+        unsigned int wakes = 0;
         for (int i = group.rank; i < n_slots; i += Group::SIZE) {
-            int wakes = 0;
-            for (int k = 0; k < n_slots && b.exists[i] && !b.awake[i] && !wakes; k++)
-                wakes = b.awake[k] && may_touch(b, i, k, reach);
-            if (wakes)
-                b.awake[i] = 1;
-            any |= wakes;
+            unsigned int left = b.exists[i] && !(awake >> i & 1) ? woken : 0u;
+            for (; left; left &= left - 1u)
+                if (may_touch(b, i, COUNT_BITS((left & (0u - left)) - 1u), reach))
+                    wakes |= 1u << i;
         }
-        sync(group);
-        any = reduce_or(group, any);
+        woken = reduce_or(group, wakes);
     }
     for (int i = group.rank; i < n_slots; i += Group::SIZE)
-        b.exists[i] &= b.awake[i];
+        b.exists[i] &= awake >> i & 1;
     sync(group);
 }
 
@@ -377,7 +375,7 @@ HD int mark_overlap(const PhysicsBodiesParams& p, Bodies& b, int env, int candid
 // Numbers touches so that those with the same number share no slot that moves, and each comes after
 // all earlier touches of its slots.
 HD void number_levels(Bodies& b, int n_slots, int n_touches) {
-    for (int i = 0; i < n_slots; i++)
+    for (int i = 0; i < n_slots && n_touches; i++)
         b.last[i] = 0;
     b.n_levels = 0;
     for (int k = 0; k < n_touches; k++) {
@@ -642,7 +640,8 @@ template <class Group>
 HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches, float h,
               int holds) {
     int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);
-    for (int i = 0; i < ITERATIONS; i++) {
+    int n_iterations = n_touches || holds ? ITERATIONS : 1;  // one has the floor's impulses
+    for (int i = 0; i < n_iterations; i++) {
         for (int a = group.rank; a < n_agents; a += Group::SIZE)
             solve_drag(b, a, h);
         sync(group);
