@@ -71,17 +71,20 @@ setup: $(SETUP)            ## create .venv
 # Python 3.10 to 3.13 get the versions in requirements/, checked against their hashes; other Pythons,
 # and those for which that fails, the newest versions. PyTorch comes from wherever pip finds it. Some
 # packages are built from source, without isolation: with the setuptools whose hash is checked.
+# pip would compile 17,000 files, one after the other: what is used is compiled when it is imported.
+INSTALL = .venv/bin/python -m pip install --no-compile
 LOCKED = $(BASE) -c 'import sys; sys.exit(sys.version_info >= (3, 14))' \
-	&& .venv/bin/python -m pip install --no-deps --require-hashes -r requirements/build.txt \
-	&& .venv/bin/python -m pip install --no-deps --require-hashes --no-build-isolation -r requirements/packages.txt -r requirements/test.txt
+	&& $(INSTALL) --no-deps --require-hashes -r requirements/build.txt \
+	&& $(INSTALL) --no-deps --require-hashes --no-build-isolation -r requirements/packages.txt -r requirements/test.txt
 
 .venv/stamp: pyproject.toml constraints.txt $(wildcard requirements/*.txt)
 	@$(BASE) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { echo "megastep needs Python 3.10 or newer. Choose one with: make BASE=python3.12"; exit 1; }
 	@$(BASE) -c 'import ensurepip' 2>/dev/null || { echo "This Python cannot create virtual environments. On Debian: apt install python3-venv"; exit 1; }
 	$(BASE) -m venv .venv
-	{ $(LOCKED); } || { echo "The versions in requirements/ cannot be installed here; taking the newest that fit."; .venv/bin/python -m pip install setuptools; }
-	.venv/bin/python -m pip install -c constraints.txt torch==2.13.0
-	.venv/bin/python -m pip install -c constraints.txt --no-build-isolation -e '.[test]'
+	{ $(LOCKED); } || { echo "The versions in requirements/ cannot be installed here; taking the newest that fit."; $(INSTALL) setuptools; }
+	$(INSTALL) -c constraints.txt torch==2.13.0
+	$(INSTALL) -c constraints.txt --no-build-isolation -e '.[test]'
+	PYTHONDONTWRITEBYTECODE= .venv/bin/python -c "import megastep.agents.cli.train, megastep.agents.cli.record"
 	touch .venv/stamp
 
 lock:                      ## resolve the versions in requirements/ anew; needs uv

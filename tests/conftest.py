@@ -10,12 +10,15 @@ os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")  # each worker imports torch, i
 import functools
 import logging
 import pickle
+from pathlib import Path
 
+import filelock
 import pytest
 import torch
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.utils import JobRuntime
 
+from megastep import cache
 from megastep.agents import package
 from megastep.agents.cli import blocks
 from megastep.agents.launch import run as launch_run
@@ -24,8 +27,22 @@ from megastep.agents.runs import provenance
 torch.set_num_threads(1)
 
 
+def pytest_configure(config):
+    """Has each worker begin with other files, so that each compiles its part of them, and finds
+    the bytecode of the others.
+    """
+    worker = getattr(config, "workerinput", None)
+    if worker and config.args == config.getini("testpaths"):
+        folder = Path(__file__).parent
+        paths = sorted(map(str, [*folder.glob("*/"), *folder.glob("test_*.py")]))
+        start = len(paths) * int(worker["workerid"][2:]) // worker["workercount"]
+        config.args = paths[start:] + paths[:start]
+
+
 def pytest_collection_modifyitems(config, items):
     """Skips what needs a GPU where there is none, or leaves it out if it was not asked for."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: item.path)
     if torch.cuda.is_available():
         return
     needy = [item for item in items if item.get_closest_marker("cuda")]
@@ -114,6 +131,20 @@ def composed_once():
         patch.setattr(
             ConfigLoaderImpl, "get_group_options", functools.partialmethod(once, list_options)
         )
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def built_once(tmp_path_factory):
+    """Has workers wait for what one of them builds, such as kernels."""
+    fetch, folder = cache.fetch, tmp_path_factory.getbasetemp().parent
+
+    def fetch_once(name, build):
+        with filelock.FileLock(folder / f"{name}.lock"):
+            return fetch(name, build)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "fetch", fetch_once)
         yield
 
 

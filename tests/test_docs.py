@@ -1,14 +1,12 @@
 """README and docs/: links and images exist, commands compose, environments have sections."""
 
 import functools
-import inspect
 import re
 import shlex
 
 import pytest
 import reference
 
-from megastep import envs, modules
 from tests.helpers.pages import MAINS, ROOT
 
 DOCS = ROOT / "docs"
@@ -61,19 +59,3 @@ def test_links_and_images_exist(page):
         place = (page.parent / path).resolve() if path else page
         assert place.exists(), target
         assert not anchor or anchor in headings(place), target
-
-
-def test_every_environment_has_a_section():
-    titles = re.findall(r"^## (\w+)$", (DOCS / "environments.md").read_text(), re.M)
-    assert set(envs.ENVS) <= {title.lower() for title in titles}
-
-
-def test_objects_page_has_the_methods_of_a_kind():
-    rows = re.findall(r"^\| `(\w+)\((.*?)\)` \|", (DOCS / "objects.md").read_text(), re.M)
-    stated = {name: re.findall(r"(?:^|, )(\w+)", arguments) for name, arguments in rows}
-    methods = {
-        name: [*inspect.signature(method).parameters][1:]
-        for name, method in (vars(modules.kinds.Kind) | vars(modules.movable.Movable)).items()
-        if callable(method) and name[0] != "_"
-    }
-    assert stated == methods

@@ -114,6 +114,13 @@ ADDED = {
 }
 #: Its test, which cores share; a page's section.
 MORE = {"environment, in PyTorch alone": 2, "learner": 2}
+IN_ONE_PROCESS = """
+import sys
+from megastep.agents.cli import entry
+for line in sys.argv[1:]:
+    name, *words = line.split()
+    assert entry.run_command(name, words) == 0
+"""
 
 
 def test_contributing_counts_the_files():
@@ -143,17 +150,17 @@ def test_one_of_each_is_added_to_a_copy(tmp_path):
         options = dict(cwd=tmp_path, env=environment, check=True, text=True, timeout=300)
         return subprocess.run(command, stdout=subprocess.PIPE, **options).stdout
 
-    assert run("-m", "megastep", "greet", "name=you") == "hello you\n"
     chosen = "env=count env.limit=4 env.n_envs=8 learner=slow learner.patience=2 agent.core=leaky"
     chosen += " agent.width=8 logger=memo logger.memo.word=said samples=256 folder=run"
     chosen += " logging.every=1"
-    run("train.py", *chosen.split(), "device=cpu")
+    words = "env=minimal geometry=rooms geometry.width=4 env.n_envs=4 env.res=8 device=cpu"
+    commands = "greet name=you", f"train {chosen} device=cpu", f"train {words} dry_run=true"
+    text = run("-c", IN_ONE_PROCESS, *commands)
+    assert text.startswith("hello you\n") and "environments" in text.rpartition("trained")[2]
     config = json.loads(next((tmp_path / "run").glob("checkpoints/*/config.json")).read_text())
     train = config["train"]
     assert (train["env"]["limit"], train["learner"]["patience"]) == (4, 2)
     assert (tmp_path / "run" / "memo.txt").read_text().startswith("said ")
-    words = "env=minimal geometry=rooms geometry.width=4 env.n_envs=4 env.res=8 device=cpu".split()
-    assert "environments" in run("train.py", *words, "dry_run=true")
     # tests over what exists take what is new
     of_all = "every_group_member or loggers or help_lists"
     run("-m", "pytest", "-q", "-n", "0", "-m", "", "-k", of_all, "tests/cli/test_config.py")

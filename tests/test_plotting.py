@@ -257,19 +257,6 @@ def test_pictures_show_themselves_and_are_equal_files_each_time():
     assert b"step 3" in plotting.encoded(figure, "svg"), "text stays text"
 
 
-@pytest.mark.parametrize("width", [8, 20, 400])
-def test_long_titles_and_notes_are_not_cut_off(width):
-    """Not one letter of them is in the margin on the right, and the last one is near to it."""
-    with plotting.styled(title=12 * "−title ", note=12 * "return −1.5, "):
-        figure, _, _ = plotting.panels(title="step 7")
-        captioned = plotting.captioned(np.full((200, width, 3), 255, np.uint8))
-    for image in plotting.rasterise(figure), captioned:
-        is_ink = (image[:70] < 128).any(-1)
-        for line in is_ink[:34], is_ink[34:]:
-            last = np.flatnonzero(line.any(0)).max()
-            assert 0.7 * len(line[0]) < last < len(line[0]) - 8
-
-
 def test_importing_the_simulator_and_training_imports_no_optional_package():
     code = (
         "import sys; import megastep; assert 'torch' not in sys.modules; "

@@ -51,13 +51,6 @@ def words_of(line):
     return script.removesuffix(".py"), words
 
 
-def test_every_command_of_the_readme_has_a_row():
-    blocks = re.findall(r"```\n(python .*?)```", (ROOT / "README.md").read_text(), re.S)
-    commands = [words_of(line) for block in blocks for line in block.splitlines()]
-    assert len(commands) == 9
-    assert commands == [words_of(typed) for typed, _ in ROWS]
-
-
 @pytest.mark.parametrize("typed, line", ROWS)
 def test_a_line_of_python_has_the_settings_of_its_command(typed, line, monkeypatch):
     made = []

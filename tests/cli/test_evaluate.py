@@ -433,7 +433,8 @@ def test_evaluations_are_paired(explorer):
     """
     words = [*EXPLORER, "geometry=box", "seed=2", "learner.lr=0.01", "folder=other/run"]
     others = [str(explorer), str(train.run(settings(*words)))]
-    homes = settings("run=x", "geometry=homes", "geometry.n=4", script="evaluate").geometry
+    words = ["run=x", "geometry=maze", "geometry.n=4", "geometry.size=3"]
+    homes = settings(*words, script="evaluate").geometry
     found = []
     for run, other in (others, others[::-1]):
         baseline = ["explorer", other, "random"]

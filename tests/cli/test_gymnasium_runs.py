@@ -37,7 +37,8 @@ def test_settings():
 
 def test_train_evaluate_and_resume_exactly(here):
     """Frozen Lake holds an array of characters, and has a number in its last info."""
-    words = [*WORDS, "env.id=FrozenLake-v1", "learner.anneal=never", "evaluation.every=32"]
+    words = [*WORDS, "env.id=FrozenLake-v1", "learner.anneal=never"]
+    words += ["evaluation.every=32", "evaluation.episodes=8"]
     assert train.main([*words, "folder=run"]) == 0
     assert evaluate.main(["run=run", "episodes=8"]) == 0
     (table,) = here.glob("run/evaluations/FrozenLake-v1-*.json")

@@ -76,9 +76,9 @@ def installed(wheel, tmp_path_factory):
     """The interpreter of a virtual environment with the wheel, and this one's packages below."""
     folder = tmp_path_factory.mktemp("installed")
     python = folder / "bin" / "python"
-    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-    command = [str(python), "-m", "pip", "install", "-q", "--no-index", "--no-deps", str(wheel)]
-    subprocess.run(command, check=True, env=ENVIRONMENT, cwd=folder)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
+    command = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-index"]
+    subprocess.run([*command, "--no-deps", str(wheel)], check=True, env=ENVIRONMENT, cwd=folder)
     (packages,) = folder.glob("lib/*/site-packages")
     # such a path is searched last, and .pth files in it, as that of this checkout, are not read
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
@@ -113,9 +113,6 @@ def run(command, folder, returncode=0, **environment):
 
 def names_in(wheel):
     return set(zipfile.ZipFile(wheel).namelist())
-
-
-# ---- A checkout ----
 
 
 # ---- The wheel ----

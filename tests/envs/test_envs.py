@@ -216,10 +216,11 @@ class TestOnTheGPU:
 @pytest.mark.parametrize("name", MOST)
 def test_cuda_kernels_on_a_cpu_give_equal_episodes(name, cuda_on_cpu, monkeypatch):
     """With the threads of a block in the order opposite to that of the CPU's loops."""
-    expected = arrdict.stack(contract.rollout(make(name), 24, check=False))
+    expected = arrdict.stack(contract.rollout(make(name, n_envs=6), 24, check=False))
     cuda_on_cpu.install(monkeypatch)
     monkeypatch.setattr(cuda_on_cpu, "order", "reversed")
-    assert contract.same(expected, arrdict.stack(contract.rollout(make(name), 24, check=False)))
+    found = contract.rollout(make(name, n_envs=6), 24, check=False)
+    assert contract.same(expected, arrdict.stack(found))
 
 
 @pytest.mark.parametrize("name", MOST)

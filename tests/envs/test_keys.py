@@ -8,7 +8,14 @@ import torch
 
 from megastep import envs, toys
 from megastep.arrdict import arrdict
-from megastep.envs.keys.episodes import OPEN, Areas, _doors, cached_episodes, episodes
+from megastep.envs.keys.episodes import (
+    OPEN,
+    Areas,
+    _doors,
+    _lock_ways_around,
+    cached_episodes,
+    episodes,
+)
 from megastep.geometries import sample
 from megastep.modules.kinds import REACH
 from tests.helpers import keys_twin
@@ -182,3 +189,11 @@ def test_step_matches_twin(seed, device, monkeypatch):
         n_opened += int(expected["metrics"][:, 1].sum())
         n_won += int(expected["terminal"].sum())
     assert n_opened > 5 and n_won > 20
+
+
+@pytest.mark.parametrize("zones, expected", [((-1, 0, 1), 2), ((-1, 1, 1), 0), ((-1, -1, 1), 0)])
+def test_doorways_between_zones_are_locked(zones, expected):
+    """Those that no door can shut, and no others."""
+    areas, states = SimpleNamespace(sides=torch.tensor([(1, 2), (0, 1)])), [0, 0]
+    _lock_ways_around(areas, {}, zones, 2, states)
+    assert states == [expected, 0]

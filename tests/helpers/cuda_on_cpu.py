@@ -9,7 +9,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import filelock
 import torch
 
 from megastep import cache
@@ -136,7 +135,7 @@ class CudaOnCpu:
         return results[0]
 
     def _build(self, library):
-        """Loads a library from the cache of kernels, which processes and sessions share."""
+        """Loads a library from the cache of kernels."""
         sources = library.sources(".h", ".cu")
         for expression, replacement in SPELLINGS:
             sources = {k: re.sub(expression, replacement, text) for k, text in sources.items()}
@@ -155,8 +154,7 @@ class CudaOnCpu:
         sources["all.cpp"] = "\n".join(lines)
         parts = HEADER.read_text(), *compile.compiler(), *FLAGS, *sources, *sources.values()
         name = f"cuda-on-cpu-{compile._key(*parts)}.so"
-        with filelock.FileLock(Path(tempfile.gettempdir()) / f"{name}.lock"):
-            return compile._load(name, *cache.fetch(name, lambda: self._compiled(sources)))
+        return compile._load(name, *cache.fetch(name, lambda: self._compiled(sources)))
 
     def _compiled(self, sources):
         with tempfile.TemporaryDirectory() as folder:

@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from scipy.stats import chi2_contingency
 
 from megastep import envs
 from megastep.envs.minigrid.original import mission_of
@@ -85,4 +84,6 @@ def _p_of_one(a, b):
     is_rare = counts.sum(0) < 20
     counts = np.column_stack([counts[:, ~is_rare], counts[:, is_rare].sum(1)])
     counts = counts[:, counts.sum(0) > 0]
+    from scipy.stats import chi2_contingency  # which takes a while to import
+
     return chi2_contingency(counts).pvalue if counts.shape[1] > 1 else 1.0

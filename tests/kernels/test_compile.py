@@ -86,12 +86,10 @@ def nvrtc(files, flags=kernel_library.CUDA_FLAGS):
 
 
 def test_nvrtc_reports_file_and_line():
-    files = ENGINE.sources(".h", ".cu")
-    nvrtc(files)
-    broken = {**files, "spawn.cu": files["spawn.cu"] + "\nint broken"}
-    line = len(broken["spawn.cu"].splitlines())
+    files = {**ENGINE.sources(".h"), "spawn.cu": ENGINE.sources(".cu")["spawn.cu"] + "\nint broken"}
+    line = len(files["spawn.cu"].splitlines())
     with pytest.raises(compile.EngineError, match=rf"spawn\.cu\({line}\): error"):
-        nvrtc(broken)
+        nvrtc(files)
 
 
 def test_no_compiler(tmp_path, monkeypatch):

@@ -281,15 +281,10 @@ def listening(pids):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_ranks_listen_on_loopback_alone(here):
-    with saving(here) as run:
-        assert listening([run.pid, *children(run.pid)]) == {"0100007F"}  # 127.0.0.1
-
-
-@pytest.mark.slow
-def test_ranks_end_with_the_process_that_launched_them(here):
+def test_ranks_listen_on_loopback_alone_and_end_with_the_process_that_launched_them(here):
     with saving(here) as run:
         pids = children(run.pid)
+        assert listening([run.pid, *pids]) == {"0100007F"}  # 127.0.0.1
         run.kill()
         deadline = time.monotonic() + 30
         while any(map(is_running, pids)) and time.monotonic() < deadline:

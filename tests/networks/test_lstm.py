@@ -113,6 +113,17 @@ def test_wrong_shapes_raise():
         lstm(x, reset, arrdict(state, cell=state.cell[:1]))
 
 
+def test_only_a_residual_layer_adds_its_input():
+    x, state = torch.randn(3, B, W), [torch.randn(B, W) for _ in range(2)]
+    weights = torch.randn(4 * W, W), torch.randn(4 * W), torch.randn(4 * W, W)
+    with plain_operations():
+        (outputs, last, _), (added, _, _) = (
+            lstm_module.lstm_sequence(x, *weights, torch.zeros(3, B).bool(), *state, is_residual)
+            for is_residual in (False, True)
+        )
+    assert torch.equal(last, outputs[-1]) and torch.equal(added, outputs + x)
+
+
 # ---- The kernels ----
 
 

@@ -39,9 +39,10 @@ def test_make_targets_and_scripts_exist(path):
 
 
 def test_all_of_ci_runs_on_github_too():
-    targets = re.findall(r"^make (.*)", (ROOT / ".ci/run").read_text(), re.M)
+    lines = re.findall(r"^make (.*)", (ROOT / ".ci/run").read_text(), re.M)
+    targets = {word for line in lines for word in line.split() if word[0] != "-"}
     matrix = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
-    assert {*targets} <= {*matrix["jobs"]["make"]["strategy"]["matrix"]["target"]}
+    assert targets <= {*matrix["jobs"]["make"]["strategy"]["matrix"]["target"]}
 
 
 @pytest.mark.skipif(not shutil.which("actionlint"), reason="actionlint is not installed")

@@ -137,23 +137,32 @@ def test_bots_never_synchronise(kind):
         torch.cuda.set_sync_debug_mode("default")
 
 
-PONG = envs.Pong(2, self_play=True, device="cpu")
+def pong():
+    return envs.Pong(2, self_play=True, device="cpu")
+
+
+def pointgoal():
+    return envs.PointGoal(1, HOMES[:1], device="cpu")
+
+
+def deathmatch():
+    return envs.Deathmatch(1, HOMES[:1], device="cpu")
 
 
 @pytest.mark.parametrize(
-    "name, env, sentence",
+    "name, make, sentence",
     [
-        *((n, PONG, f"{n} cannot play in Pong.*Pong has no core") for n in BOTS if n != "random"),
-        ("hunter", envs.PointGoal(1, HOMES[:1], device="cpu"), "hunts others by the observation d"),
-        ("explorer", Matrix(2), "explorer cannot play in Matrix"),
-        ("runner", envs.Deathmatch(1, HOMES[:1], device="cpu"), "is_hider says who runs"),
-        ("oracle", envs.PointGoal(1, HOMES[:1], device="cpu"), "PointGoal has no cue"),
-        ("hunted", PONG, "hunted"),
+        *((n, pong, f"{n} cannot play in Pong.*Pong has no core") for n in BOTS if n != "random"),
+        ("hunter", pointgoal, "hunts others by the observation d"),
+        ("explorer", lambda: Matrix(2), "explorer cannot play in Matrix"),
+        ("runner", deathmatch, "is_hider says who runs"),
+        ("oracle", pointgoal, "PointGoal has no cue"),
+        ("hunted", pong, "hunted"),
     ],
 )
-def test_refusals(name, env, sentence):
+def test_refusals(name, make, sentence):
     with pytest.raises(UserError, match=sentence) as error:
-        factory.make_bot(name, SimpleNamespace(), env)
+        factory.make_bot(name, SimpleNamespace(), make())
     assert "\n" not in str(error.value)
 
 
