@@ -191,24 +191,21 @@ class HideAndSeek(FirstPerson):
         self.blind = torch.zeros_like(self.seen)
 
     def _furnish(self, geometries, resample) -> modules.RandomSpawns:
-        core, n_seekers = self.core, self.n_agents - self.n_hiders
+        core = self.core
         self.seed = derived_seed(core.seed, "hideandseek")
         options: dict = dict(n_points=1, grab_elevated=self._grab_elevated)
         self.objects = modules.Objects(geometries, core, self._kinds, COLOURS, **options)
-        layouts, teams = core.scenery.layouts, linear([modules.COLOURS[team] for team in TEAMS])
+        layouts = core.scenery.layouts
         textures = layouts.agent_textures.view(len(layouts), self.n_agents, -1, 3)
         is_front = (textures == torch.tensor(FRONT_COLOUR).to(textures)).all(-1, keepdim=True)
-        colours = (
-            torch.tensor(teams)
-            .to(textures)
-            .repeat_interleave(torch.tensor([self.n_hiders, n_seekers], device=core.device), 0)
-        )
+        names = [TEAMS[a >= self.n_hiders] for a in range(self.n_agents)]
+        colours = torch.tensor(linear([modules.COLOURS[name] for name in names])).to(textures)
         textures.copy_(torch.where(is_front, textures, colours[:, None]))
 
         is_quadrant = self.variant == "quadrant"
         outer, inner = (starts.OUTER, starts.INNER) if is_quadrant else (starts.ANYWHERE,) * 2
         radii = [core.agents.radius] * self.n_agents
-        rooms = [starts.ANYWHERE] * self.n_hiders + [outer] * n_seekers
+        rooms = [starts.ANYWHERE] * self.n_hiders + [outer] * (self.n_agents - self.n_hiders)
         for name, kind in self._kinds.items():
             radii += [math.hypot(kind.side, kind.width or kind.side) / 2] * kind.count
             rooms += [starts.ANYWHERE if name == "ramp" else inner] * kind.count
@@ -231,12 +228,10 @@ class HideAndSeek(FirstPerson):
         return super()._begin(whole.expand(-1, self.n_agents).flatten())
 
     def desync(self) -> None:
-        """Gives every environment a random age, from the seed, so that episodes do not end
-        together.
-        """
+        """Gives every environment a random age, so that episodes do not end together."""
         super().desync()
         ages = self.ages.view(self.n_envs, -1)
-        ages.copy_(ages[:, :1].expand_as(ages).clone())
+        ages.copy_(ages[:, :1].clone())
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
