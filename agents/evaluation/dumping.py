@@ -21,7 +21,7 @@ import torch
 from megastep import data, spaces
 from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import eval_env
+from megastep.agents.evaluation import eval_env, playing
 from megastep.agents.factory import check, components, env_failures, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.generator import SeededGenerator, stream_seed
@@ -221,6 +221,7 @@ class Waves:
         about = STEPS, self.n_lanes, self.told.obs_space, env.action_space, state, env.device
         rollout = Rollout(*about, values=False)
         self.collect = Collector(cast(Env, self.told), cast(Any, self.actor), rollout)
+        self.collect.can_capture &= playing.can_capture(env, [policy])
 
     # ---- Playing ----
 

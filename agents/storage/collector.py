@@ -30,7 +30,7 @@ def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
     first = rollout.select_lanes(env.reset())
     rollout.allocate_optional(first)
     world = _stored(first).map(torch.clone)
-    return arrdict(world=world, state=policy.initial(len(world.reset)))
+    return arrdict(world=world, state=policy.initial(len(world.reset), world.reset.device))
 
 
 @torch.no_grad()

@@ -219,7 +219,7 @@ def raycast(walls: torch.Tensor, poses: torch.Tensor, n_pixels: int = 64) -> tor
 def queries(one: arrdict, generator: torch.Generator, every: int = 8, ahead: int = 40) -> tuple:
     """Returns steps `now` (Q,) of an episode, and later ones to ask about, at most `ahead`."""
     n = len(one.reward)
-    now = torch.arange(every, n - 1, every)
+    now = torch.arange(every, max(n - 1, every), every)
     gap = 1 + (torch.rand(len(now), generator=generator) * ahead).long()
     return now, (now + gap).clamp(max=n)
 
