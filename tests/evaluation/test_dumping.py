@@ -195,10 +195,26 @@ def test_a_trained_agent_plays_its_own_environment(few, tmp_path):
     assert not batch.reward[n[1] :, 1].any()
 
 
+def test_what_a_bot_remembers_is_on_the_device(few, tmp_path, monkeypatch):
+    """While it plays, a tensor that is made on no device in particular is one without data."""
+
+    def inside(function):
+        def call(*args):
+            with torch.device("meta"):
+                return function(*args)
+
+        return call
+
+    for name in "initial_actor_state", "collect":
+        monkeypatch.setattr(collector, name, inside(getattr(collector, name)))
+    dumped(tmp_path / "data", "env=explorer", "geometry=box", "max_steps=9", bot="explorer", n=2)
+
+
 @pytest.mark.cuda
-def test_graphs_have_the_bytes_of_single_steps(few, tmp_path, monkeypatch):
+@pytest.mark.parametrize("player", ["run=memory_9", "bot=explorer"])
+def test_graphs_have_the_bytes_of_single_steps(player, few, tmp_path, monkeypatch):
     words = "env=memory", "geometry=memory_maze", "geometry.n=6", "max_steps=40", "truth=true"
-    words = ["run=memory_9", "episodes=10", "device=cuda", *words]
+    words = [player, "episodes=10", "device=cuda", *words]
     assert dump.main([*words, f"folder={tmp_path / 'graphs'}"]) == 0
     monkeypatch.setattr(collector, "capture_with", lambda env, policies, function, **_: function)
     assert dump.main([*words, f"folder={tmp_path / 'steps'}"]) == 0
