@@ -154,6 +154,7 @@ EXPLORER = [
     *("env=explorer", "env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1"),
     *("agent.width=8", "learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"),
 ]
+MAZES = ["run=x", "geometry=maze", "geometry.n=4", "geometry.size=3"]
 
 
 @pytest.fixture
@@ -402,7 +403,7 @@ def test_evaluate_refuses_another_environment(trained, tmp_path):
 
 def test_episodes_are_written_one_by_one(explorer):
     """The rows' means are those of the table, and each home has as many."""
-    homes = settings("run=x", "geometry=homes", "geometry.n=4", script="evaluate").geometry
+    homes = settings(*MAZES, script="evaluate").geometry
     bots = ["random", "explorer"]
     written = evaluate.run(configured(run=str(explorer), geometry=homes, baseline=bots))
     result = json.loads(written.read_text())
@@ -424,7 +425,7 @@ def test_episodes_are_written_one_by_one(explorer):
         assert len(spots) == 8
     columns = result["episodes"]
     assert columns["return"] == [float(row["return"]) for row in rows]
-    assert columns["source"] == ["homes"] * 24 if "source" in columns else True
+    assert columns["source"] == ["maze"] * 24 if "source" in columns else True
 
 
 def test_evaluations_are_paired(explorer):
@@ -433,8 +434,7 @@ def test_evaluations_are_paired(explorer):
     """
     words = [*EXPLORER, "geometry=box", "seed=2", "learner.lr=0.01", "folder=other/run"]
     others = [str(explorer), str(train.run(settings(*words)))]
-    words = ["run=x", "geometry=maze", "geometry.n=4", "geometry.size=3"]
-    homes = settings(*words, script="evaluate").geometry
+    homes = settings(*MAZES, script="evaluate").geometry
     found = []
     for run, other in (others, others[::-1]):
         baseline = ["explorer", other, "random"]

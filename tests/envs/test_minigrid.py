@@ -122,12 +122,12 @@ def test_agents_play_here_as_in_the_original(tmp_path, monkeypatch):
         ["env=gymnasium", f"env.id=minigrid:{id}", f"env.wrappers=[{wrapper}]"],
     )
     small = "agent.encoder=categories agent.core=none agent.width=32 device=cpu".split()
-    for name, trained_in, samples in ("here", here, 40000), ("there", there, 4000):
+    for name, trained_in, samples in ("here", here, 40000), ("there", there, 2000):
         words = [*small, "env.n_envs=32", f"samples={samples}", f"folder={name}"]
         assert train.main([*trained_in, *words]) == 0
         rows = []
         for played_in in here, there:
-            words = [f"run={name}", "episodes=128", "device=cpu", "baseline=none"]
+            words = [f"run={name}", "episodes=64", "device=cpu", "baseline=none"]
             assert evaluate.main([*played_in, *words]) == 0
             tables = (tmp_path / name / "evaluations").glob("*.json")
             newest = max(tables, key=lambda path: path.stat().st_mtime_ns)

@@ -18,8 +18,9 @@ from tests.helpers import tiny
 WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, f"samples={20 * tiny.UPDATE}", "logging.every=2"]
 FILES = ["metrics.jsonl", "perf.jsonl", "provenance.jsonl", "evaluations/*.json"]
 #: Values where there are others.
-ODD = ["planted:Thing", 10**400, None, [], -1, float("nan")]
-SLOW = [pytest.param(value, marks=pytest.mark.slow) for value in ODD[2:]]
+ODD = ["planted:Thing", 10**400, None, float("nan"), [], -1]
+SLOW = [pytest.param(value, marks=pytest.mark.slow) for value in (None, float("nan"))]
+SLOW += [pytest.param(value, marks=pytest.mark.nightly) for value in ([], -1)]
 
 
 @pytest.fixture(scope="module")
