@@ -97,7 +97,8 @@ def test_nothing_overlaps_by_more_than_the_slop(source, n_envs, n_steps):
             hold_some(scenery, agents, random)
     assert worst <= 0.005 + 1e-5 and n_moved > n_steps / 4
     extents = scenery.layouts.extents.view(-1, 4)[scenery.layout.long()][:, None]
-    assert ((o.positions > extents[..., :2]) & (o.positions < extents[..., 2:])).all()
+    for at in (o.positions, agents.positions):
+        assert ((at > extents[..., :2]) & (at < extents[..., 2:])).all()
 
 
 def pair(friction=0.0, n_agents=1, shapes=("crate", "crate"), at=((2.0, 3.0), (2.5, 3.0)), **more):
