@@ -1,6 +1,7 @@
 """Hide and seek: its rules by hand and against a twin, starts, and quadrant rooms."""
 
 import collections
+import hashlib
 
 import numpy as np
 import pytest
@@ -303,6 +304,10 @@ def test_quadrants_have_openings_that_an_agent_passes_and_a_box_closes():
             labels, _ = geometry.components(free)
             inside = {int(labels[int(y / 0.02), int(x / 0.02)]) for x, y in g.lights}
             assert len(inside) == n_parts
+    digest = hashlib.sha256(b"".join(g.walls.tobytes() + g.masks.tobytes() for g in rooms[:9]))
+    assert digest.hexdigest()[:16] == "7337cd17322144a6", (
+        "a seed gives the same bytes on every machine"
+    )
 
 
 def test_cached_starts_are_those_that_were_drawn(tmp_path, monkeypatch):
