@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from adapter_steps import adapters
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, hideandseek, mazes, memory, objects, pong, step
+from learning import grids, ppo
 from populations import members, small_members
 from scaling import scaling
 from training import startup, train
@@ -24,6 +25,8 @@ ALL = (
     memory,
     adapters,
     pong,
+    grids,
+    ppo,
     startup,
 )
 ALL += (cpu, train, scaling, members, small_members)

@@ -3,6 +3,7 @@
 import benchmark
 import engine_operations
 import env_steps
+import learning
 import pytest
 import random_walks
 import records
@@ -24,6 +25,8 @@ def tiny_benchmarks(monkeypatch):
         (env_steps, "N_ARENAS", (8,)),
         (engine_operations, "N_AGENTS", (8,)),
         (engine_operations, "N_ARENAS", 8),
+        (learning, "N_GRIDS", (8,)),
+        (learning, "RUNS", (learning.Run("free", 8, 2, "minGRU", dict(core="mingru"), 4),)),
     ):
         monkeypatch.setattr(module, name, {"cuda": value, "cpu": value})
     monkeypatch.setattr(random_walks, "N_HOMES", 2)
@@ -40,7 +43,7 @@ def tiny_benchmarks(monkeypatch):
     ("name", "n_records"),
     [
         *(("step", 5), ("kernels", 8), ("observe", 2), ("agents", 1), ("deathmatch", 2)),
-        *(("memory", 1), ("pong", 2)),
+        *(("memory", 1), ("pong", 2), ("grids", 7), ("ppo", 1)),
     ],
 )
 def test_benchmark_appends_json_lines(name, n_records, device, tiny_benchmarks, tmp_path, capsys):
