@@ -7,11 +7,13 @@ from typing import cast
 
 import numpy as np
 import torch
+from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.capture import Graph, capture
 from megastep.dotdict import leaves, mapping
+from megastep.engine.resets import copies
 from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 
 __all__ = ["Copies", "Lanes", "ended", "fresh"]
@@ -183,7 +185,8 @@ class Lanes:
         world, _, over = self._next_step(decision)
         if not self._on_gpu and not over.any():
             return world, world, over
-        final = world.clone()
+        tensors, spec = tree_flatten(world)
+        final = tree_unflatten(copies(tensors), spec)
         return self._reset(mask=over), final, over
 
     def close(self) -> None:

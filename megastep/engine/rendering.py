@@ -56,7 +56,7 @@ class Observation(NamedTuple):
 _OPTIONAL = dict.fromkeys(
     (
         *(*Render._fields, *Observation._fields),
-        *("velocity", "angvelocity", "seen", "clear_mask", "n_words"),
+        *("velocity", "angvelocity", "seen", "clear_mask", "n_words", "only"),
     ),
     0,
 )
@@ -103,6 +103,8 @@ def observe(
     seen: torch.Tensor | None = None,
     clear_mask: torch.Tensor | None = None,
     max_depth: float = 10.0,
+    only: torch.Tensor | None = None,
+    out: Observation | None = None,
 ) -> Observation:
     """Renders what training needs, in one pass and without full-resolution tensors: the same as
     :func:`render` followed by the sensors of :mod:`~megastep.modules`. With one agent per
@@ -115,6 +117,8 @@ def observe(
             view are marked in place and counted in ``newly_seen``.
         clear_mask: (N, A) bool, agents whose ``seen`` is cleared first.
         max_depth: metres beyond the agent's radius at which depth reads 0.
+        only: (N, A) bool, agents to render. The others keep their rows of ``out`` and ``seen``.
+        out: what the same call returned before; written in place and returned.
     """
     lanes, device = lanes_of(scenery, agents), scenery.device
     if agents.res % checks.integer("subsample", subsample, 1, MAX_SUBSAMPLE):
@@ -134,17 +138,22 @@ def observe(
         seen_fields = dict(seen=address, n_words=n_words, clear_mask=mask)
     elif clear_mask is not None:
         raise ValueError("clear_mask clears seen, but seen was not given")
+    seen_fields["only"] = checks.address("only", only, lanes, torch.bool, device, True)
+    if out is not None:
+        checks.instance("out", out, Observation)
+    elif only is not None:
+        raise ValueError("with only, some agents are not rendered: give out, which has their rows")
     if scenery.n_agents > 1:
         update_agent_geometry(scenery, agents, lit=rgb)
     shape, pixels = _per_camera(scenery, agents), agents.res // subsample
     half, int32 = torch.float16, torch.int32
-    out = Observation(
+    out = out or Observation(
         rgb=torch.empty((*shape, 3, pixels), dtype=half, device=device) if rgb else None,
         depth=torch.empty((*shape, pixels), dtype=half, device=device) if depth else None,
         centre_line=torch.empty(shape, dtype=int32, device=device) if centre_line else None,
         agent_ray=torch.empty(shape, dtype=int32, device=device) if agent_ray else None,
         imu=torch.empty((*lanes, 3), dtype=half, device=device) if imu else None,
-        newly_seen=torch.empty(lanes, dtype=int32, device=device) if seen_fields else None,
+        newly_seen=torch.empty(lanes, dtype=int32, device=device) if seen is not None else None,
     )
     if scenery.objects is not None and scenery.objects.lit:
         update_objects(scenery, agents)

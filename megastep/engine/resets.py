@@ -1,7 +1,7 @@
 """Resets of some lanes: by a mask, and by a seed. N environments, B lanes."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch.utils import _pytree
@@ -35,20 +35,24 @@ class Resets:
     Attributes:
         last: the last world, or None.
         is_used: whether a mask was ever given.
+        parts: what an environment made the last ``world``, which is among them, of.
+        mask: (B,) bool, lanes whose rows of ``parts`` are written now, in place. None: all, anew.
     """
 
-    __slots__ = ("lanes_last", "draws", "last", "is_used")  # no __dict__, so no state
+    __slots__ = ("lanes_last", "draws", "last", "is_used", "parts", "mask")  # so no state
 
     def __init__(self, lanes_last: tuple[str, ...] = (), draws: Mapping[str, int] | None = None):
         self.lanes_last, self.draws, self.is_used = lanes_last, draws or {}, False
         self.last: arrdict | None = None
+        self.parts: dict[str, Any] = {}
+        self.mask: torch.Tensor | None = None
 
     def __reduce__(self) -> tuple:
         return Resets, (self.lanes_last, self.draws)  # a copy has no last world yet
 
     def keep(self, world: "arrdict") -> "arrdict":
         """Remembers and returns a world. Call it on what ``step`` returns."""
-        self.last = world
+        self.last = self.parts["world"] = world
         return world
 
     def __call__(
@@ -57,10 +61,12 @@ class Resets:
         begin: Callable[[torch.Tensor], "arrdict"],
         seed: int | torch.Tensor | None = None,
         mask: torch.Tensor | None = None,
+        begin_in_place: Callable[[torch.Tensor], bool] = lambda mask: False,
     ) -> "arrdict":
         """Begins episodes, as described at ``reset`` of :class:`~megastep.types.Env`. ``begin``
         takes a mask (B,), begins an episode in these lanes, and returns a world. What it does to
-        other lanes is undone. TypeError or ValueError name an argument that does not fit.
+        other lanes is undone. ``begin_in_place`` does it to the last world and to no other lane, or
+        returns False. TypeError or ValueError name an argument that does not fit.
         """
         everyone = torch.ones(n_lanes(env), dtype=torch.bool, device=env.device)
         world = self.last
@@ -78,8 +84,10 @@ class Resets:
             self.last = begin(chosen)
             return self.last
         self.is_used = True
+        if begin_in_place(chosen):
+            return world
         rows, leaves = [*self._rows(env)], _pytree.tree_leaves(world)
-        before = _copies([*(leaf for leaf, _ in rows), *leaves])
+        before = copies([*(leaf for leaf, _ in rows), *leaves])
         new = begin(chosen)
         began, fresh = new["reset"].clone(), _pytree.tree_leaves(new)
         # in place, so that a CUDA graph that steps and one that resets share the world
@@ -117,7 +125,7 @@ class Resets:
             counter.copy_(torch.where(places, starts.to(counter.dtype), counter))
 
 
-def _copies(leaves) -> list[torch.Tensor]:
+def copies(leaves: list[torch.Tensor]) -> list[torch.Tensor]:
     """Returns copies of tensors, on a GPU by a kernel for those of each dtype."""
     pairs = [(torch.empty_like(leaf), leaf) for leaf in leaves]
     for dtype in {leaf.dtype for leaf in leaves}:

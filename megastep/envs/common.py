@@ -56,14 +56,17 @@ def judged(
     """Launches the kernel of the step of a game in scenery, by default with a thread per lane.
     Returns its :func:`step_outputs`; those of a critic are None unless ``env.privileged_space``.
     """
-    core, n_lanes = env.core, env.n_envs * env.n_agents
+    core, resets, n_lanes = env.core, env._resets, env.n_envs * env.n_agents
     critic = dict.fromkeys(critic, 0) if env.privileged_space is None else critic
-    outputs = step_outputs(env, n_metrics, obs, critic)
+    if resets.mask is None:
+        resets.parts["outputs"] = step_outputs(env, n_metrics, obs, critic)
+    outputs = resets.parts["outputs"]
     launch(
         *(library, operation, env.device, n_threads or n_lanes),
         **world_params(core.scenery, core.agents, "positions", "angles"),
         ages=env.ages,
         ended=env.ended,
+        only_ended=int(resets.mask is not None),
         **outputs,
         **fields,
     )
@@ -102,7 +105,8 @@ class DisplayedEnv:
                 game begins anew with a lane of the mask, as in Pong. Returns the last world, with
                 new rows in place.
         """
-        return self._resets(cast(Env, self), self._begin, seed, mask)
+        in_place = getattr(self, "_begin_in_place", lambda mask: False)
+        return self._resets(cast(Env, self), self._begin, seed, mask, in_place)
 
     def display(self, e: int = 0) -> "Figure":
         """Draws environment ``e`` as it is now. Returns a matplotlib figure."""

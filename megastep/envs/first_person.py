@@ -80,6 +80,8 @@ class FirstPerson(SceneryEnv):
     source = "homes"
     #: The robot that the agents are. None: they are discs that see by cameras.
     robot: modules.Robot | None = None
+    #: Set in a class, not for subclasses, whose worlds hold what `_view` and `judged` made alone.
+    begins_in_place: bool
     #: Steps after which an episode is truncated.
     limit: int
 
@@ -146,6 +148,22 @@ class FirstPerson(SceneryEnv):
         self.ended.copy_(mask)
         return self._world()
 
+    def _begin_in_place(self, mask) -> bool:
+        parts = type(self.movement), type(self.spawner)
+        is_known = parts == (modules.MomentumMovement, modules.RandomSpawns)
+        if "begins_in_place" not in vars(type(self)) or not is_known:
+            return False
+        if self._resets.parts.get("world") is not self._resets.last:
+            return False  # the last world may come from elsewhere, such as a checkpoint
+        ended = self.ended.clone()
+        self._resets.mask = mask
+        try:
+            self._begin(mask)
+        finally:
+            self._resets.mask = None
+        self.ended.copy_(torch.where(mask, self.ended, ended))
+        return True
+
     def desync(self) -> None:
         """Gives every lane a random age, from the seed, so that episodes do not end together."""
         limits = torch.full_like(self.ages, self.limit)
@@ -161,8 +179,15 @@ class FirstPerson(SceneryEnv):
 
     def _view(self, core: Core | None = None, **seen: Any) -> engine.Observation:
         """Returns what all cameras see, or those of a core. ``seen``: as ``engine.observe``."""
-        core = core or self.core
-        return engine.observe(core.scenery, core.agents, self.subsample, imu=True, **seen)
+        if core is not None:
+            return engine.observe(core.scenery, core.agents, self.subsample, imu=True, **seen)
+        parts, kept = self._resets.parts, {}
+        if self._resets.mask is not None:
+            mask = modules.to_agents(self._resets.mask, self.n_agents)
+            kept = dict(only=mask, out=parts["view"])
+        core = self.core.scenery, self.core.agents
+        parts["view"] = engine.observe(*core, self.subsample, imu=True, **seen, **kept)
+        return parts["view"]
 
     def truth(self) -> arrdict:
         """Returns what no agent observes, (B, ...) float32: ``agent_pos`` (2), metres;

@@ -77,6 +77,7 @@ struct RenderParams : WorldParams {
     unsigned int* seen;        // (N, A, n_words) in and out: a bit per static texel
     const unsigned char* clear_mask;  // (N, A) 1: clear seen first
     int* newly_seen;                  // (N, A) out: texels newly marked in seen
+    const unsigned char* only;        // (N, A) 1: is rendered; null: all are
     int n_words;
     ObjectsParams objects;
 };

@@ -383,7 +383,8 @@ KERNEL render(const RenderParams& p) {
         Scratch scratch = {{}, {}, {}, {}, Rays(p.res), {}};
 #pragma omp for schedule(static)
         for (int agent = 0; agent < p.scenery.n_envs * p.scenery.n_agents; agent++)
-            render_agent(p, agent, scratch);
+            if (!p.only || p.only[agent])
+                render_agent(p, agent, scratch);
     }
 }
 

@@ -119,6 +119,8 @@ DEVICE int agent_ray_of(const NearestLine* nearest, int res, int n_agent_lines, 
 template <int full_res, int drawn, int is_split>
 DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelSpan* spans,
                          NearestLine* nearest, int* newly_seen_by_warp) {
+    if (p.only && !p.only[agent])
+        return;
     const SceneryParams& s = p.scenery;
     int warp = threadIdx.x / WARP;
     int rank = is_split ? threadIdx.x : warp_lane, n_threads = is_split ? BLOCK : WARP;

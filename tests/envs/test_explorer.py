@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from megastep import contract, core, envs, modules, scene, toys
+from megastep import contract, core, engine, envs, modules, scene, toys
 from megastep.arrdict import arrdict
 from megastep.envs.explorer import texel_runs
 from megastep.geometries import sample
@@ -43,7 +43,7 @@ def judge(c, newly_seen, seen, runs, state, coverage=False, privileged=False):
     env = SimpleNamespace(
         **dict(core=c, n_envs=c.n_envs, n_agents=c.n_agents, device=c.device),
         **dict(seen=seen, runs=runs, **state, patience=7),
-        **dict(has_metrics=coverage, privileged_space=privileged or None),
+        **dict(has_metrics=coverage, privileged_space=privileged or None, _resets=engine.Resets()),
     )
     out = envs.Explorer._judge(env, newly_seen)
     metrics = out.pop("metrics")

@@ -246,3 +246,27 @@ def test_captured_resets_are_resets_and_do_not_synchronise(name):
             world = captured.reset(seed=seed, mask=mask)
             assert contract.same(world, twin.reset(seed=seed, mask=mask))
             seed, mask = seed + 1, ~mask
+
+
+@pytest.mark.parametrize("on_gpu", [False, True], ids=["cpu", "cuda kernels"])
+@pytest.mark.parametrize("name", ["explorer", "memory", "keys", "pointgoal"])
+def test_lanes_that_begin_in_place_begin_as_elsewhere(name, on_gpu, request, monkeypatch):
+    """A subclass computes a new world, of which it takes the rows of the lanes that begin. After
+    each reset the state is equal too, of these lanes and of the others.
+    """
+    kind, settings = MAKERS[name]
+    own, other = (one(N, device="cpu", **settings) for one in (kind, type("Other", (kind,), {})))
+    if on_gpu:
+        request.getfixturevalue("cuda_on_cpu").install(monkeypatch)
+    assert contract.same(own.reset(), other.reset())
+    for decision in decisions(own, 3 if on_gpu else 20):
+        worlds = [env.step(decision).clone() for env in (own, other)]
+        assert contract.same(*worlds)
+        mask = worlds[0].terminal | worlds[0].truncated | (torch.arange(N) == 3)
+        address = own._resets.last.obs.rgb.data_ptr()
+        worlds = [env.reset(mask=mask) for env in (own, other)]
+        assert contract.same(*worlds) and worlds[0].obs.rgb.data_ptr() == address
+        states = [state_tree(env) for env in (own, other)]
+        assert all(is_same(leaf, states[1][path]) for path, leaf in states[0].items())
+    nobody = torch.zeros(N, dtype=torch.bool)
+    assert own._begin_in_place(nobody) and not other._begin_in_place(nobody)

@@ -154,13 +154,24 @@ def operations(f):
     yield engine.update_agent_geometry, dict(both, lit=True), dict(OPERANDS, lit=flags)
     yield (
         engine.observe,
-        dict(both, subsample=4, seen=f.seen, clear_mask=f.mask, max_depth=10.0, imu=True),
+        dict(
+            both,
+            subsample=4,
+            seen=f.seen,
+            clear_mask=f.mask,
+            max_depth=10.0,
+            imu=True,
+            only=f.mask,
+            out=engine.observe(f.scenery, f.agents, 4, imu=True, seen=f.seen),
+        ),
         dict(
             OPERANDS,
             subsample=integers(1, 32),
             seen=tensors,
             clear_mask=optional_tensors,
             max_depth=numbers(0, -1),
+            only=optional_tensors,
+            out=objects,
             **dict.fromkeys(("imu", "rgb", "depth", "centre_line", "agent_ray"), flags),
         ),
     )
@@ -295,6 +306,7 @@ def others(device):
 
     mask = torch.ones((N, A), dtype=torch.bool, device=device)
     yield "observe without seen", "clear_mask", observe(clear_mask=mask)
+    yield "observe only some without out", "only", observe(only=mask)
     yield "subsample no divisor", "subsample", observe(subsample=3)
     yield "too few points", "points", lambda f: spawn(f, f.points[:, :1].contiguous())
     yield "agents of fewer environments", "positions", of_fewer

@@ -109,6 +109,8 @@ class Explorer(FirstPerson):
         metrics: if False, worlds have no ``metrics``.
     """
 
+    begins_in_place = True
+
     @checked
     def __init__(
         self,

@@ -71,6 +71,8 @@ class Keys(FirstPerson):
             the fraction of the steps that is left.
     """
 
+    begins_in_place = True
+
     @checked
     def __init__(
         self,

@@ -109,6 +109,7 @@ class Memory(FirstPerson):
     """
 
     source = "memory_maze"
+    begins_in_place = True
 
     @checked
     def __init__(

@@ -78,6 +78,8 @@ class PointGoal(FirstPerson):
         robot: what drives: size, limits, lidar. It has differential control. Default: none.
     """
 
+    begins_in_place = True
+
     @checked
     def __init__(
         self,

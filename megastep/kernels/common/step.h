@@ -20,7 +20,11 @@ struct GameParams : OutcomeParams {
     int* ages;             // (N, A) in and out: steps since the first observation
     unsigned char* ended;  // (N, A) in: starts an episode in this step; out: ends it in this step
     int* error_flag;       // (1) out: see common/errors.h
+    int only_ended;        // 1: only lanes that `ended` take part
 };
+
+// Whether a lane takes part in the step.
+HD int takes_part(const GameParams& p, int i) { return !p.only_ended || p.ended[i]; }
 
 // Writes how lane i's step ends: the episode, if it `ends`, by the game's rule or by time.
 HD void write_outcome(const OutcomeParams& p, int i, float reward, int reset, int ends, int rule) {

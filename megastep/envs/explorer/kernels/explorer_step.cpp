@@ -57,5 +57,6 @@ KERNEL explorer_step(const ExplorerStepParams& p) {
     const SceneryParams& s = p.scenery;
 #pragma omp parallel for schedule(static) num_threads(s.n_threads)
     for (int agent = 0; agent < s.n_envs * s.n_agents; agent++)
-        step_agent(p, agent);
+        if (takes_part(p, agent))
+            step_agent(p, agent);
 }

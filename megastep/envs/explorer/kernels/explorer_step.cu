@@ -37,6 +37,8 @@ DEVICE int count_left(const ExplorerStepParams& p, int agent, const Runs& runs, 
 
 // All warp lanes read an agent's episode, and one writes it.
 DEVICE void step_privileged(const ExplorerStepParams& p, int agent, int warp_lane, int* bins) {
+    if (!takes_part(p, agent))
+        return;
     int env = agent / p.scenery.n_agents, layout = layout_of(p.scenery, env, p.error_flag);
     Episode episode = next(p, read_episode(p, agent));
     Pose pose = pose_of(p, agent, env);
@@ -59,7 +61,7 @@ DEVICE void step_privileged(const ExplorerStepParams& p, int agent, int warp_lan
 
 DEVICE void step_plain(const ExplorerStepParams& p, int agent, int warp_lane) {
     const SceneryParams& s = p.scenery;
-    int exists = agent < s.n_envs * s.n_agents;
+    int exists = agent < s.n_envs * s.n_agents && takes_part(p, agent);
     Episode episode = {0, 0, 0, 1};
     if (exists) {
         episode = next(p, read_episode(p, agent));

@@ -102,6 +102,8 @@ HD void write_privileged(const KeysStepParams& p, int env, int age) {
 }
 
 HD void keys_env(const KeysStepParams& p, int env) {
+    if (!takes_part(p, env))
+        return;
     int reset = p.ended[env], n = p.n_colours, success = 0;
     Object* things = things_of(p, env);
     if (reset)

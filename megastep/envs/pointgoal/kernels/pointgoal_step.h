@@ -123,6 +123,8 @@ HD void write_metrics(const PointgoalStepParams& p, int agent, int n, int ends, 
 
 // One step of one agent.
 HD void pointgoal_agent(const PointgoalStepParams& p, int agent) {
+    if (!takes_part(p, agent))
+        return;
     const SceneryParams& s = p.scenery;
     int env = agent / s.n_agents, layout = layout_of(s, env, p.error_flag);
     int n = s.n_envs * s.n_agents, reset = p.ended[agent];
