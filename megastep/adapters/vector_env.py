@@ -29,8 +29,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     Args:
         env: the environment.
         autoreset_mode: when a lane begins its next episode. ``NEXT_STEP``: in the step after its
-            last. ``SAME_STEP``: at once; ``infos`` have the last observation as ``final_obs``;
-            most environments render all lanes twice, docs/adapters.md says which do not. ``DISABLED``: by ``reset(options={"reset_mask": mask})``.
+            last. ``SAME_STEP``: at once; ``infos`` have the last observation as ``final_obs``, and
+            most environments render all lanes twice; docs/adapters.md says which do not.
+            ``DISABLED``: by ``reset(options={"reset_mask": mask})``.
         to_numpy: return arrays; otherwise tensors on the device, without synchronising. Tensors of
             ``infos`` are there in every step then, with masks. Where the environment allows some
             actions only, ``infos["action_mask"]`` says which in every step: int8 arrays, or bool.
