@@ -99,7 +99,7 @@ def _claim(folder, about) -> None:
     with user_errors(kinds=(data.DatasetError,)):
         old = data.about(folder)
     about = json.loads(_text(about))  # as JSON has it
-    old, new = (dict(check.leaves({k: v for k, v in one.items()})) for one in (old, about))
+    old, new = dict(check.leaves(old)), dict(check.leaves(about))
     if changed := [key for key in {**old, **new} if old.get(key) != new.get(key)]:
         key = changed[0]
         raise UserError(
@@ -138,8 +138,6 @@ class _Told:
         self.obs_space = dict(seen=env.obs_space, truth=space)
 
     def __getattr__(self, name: str) -> Any:
-        if name == "env":
-            raise AttributeError(name)
         return getattr(self.env, name)
 
     def reset(self, **options) -> arrdict:

@@ -232,6 +232,8 @@ def _feature(array) -> dict[str, Any]:
 class _Stats:
     """Minimum, maximum, mean and standard deviation of each feature, as LeRobot keeps them."""
 
+    JOINED = np.minimum, np.maximum, np.add, np.add, np.add
+
     def __init__(self) -> None:
         self.sums: dict[str, list[np.ndarray]] = {}
 
@@ -242,11 +244,8 @@ class _Stats:
                 values = array.reshape(-1, array.shape[-1]) / 255
             new = [values.min(0), values.max(0), values.sum(0), np.square(values).sum(0)]
             new.append(np.array([len(values)]))
-            low, high, *sums = self.sums.get(name, new)
-            if name in self.sums:
-                low, high = np.minimum(low, new[0]), np.maximum(high, new[1])
-                sums = [old + one for old, one in zip(sums, new[2:])]
-            self.sums[name] = [low, high, *sums]
+            old = self.sums.get(name)
+            self.sums[name] = [f(*two) for f, *two in zip(self.JOINED, old, new)] if old else new
 
     def result(self) -> dict[str, dict[str, Any]]:
         found = {}

@@ -9,9 +9,9 @@ T time, M lanes, E episodes, Q queries, P pixels, W features.
 
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, cast
 
 import numpy as np
 import torch
@@ -159,8 +159,7 @@ class Model:
 
     def __init__(self, run: str, untrained: bool = False):
         loaded = folders.load_checkpoint(folders.find(run), True, "cpu", is_whole=True)
-        self.policy, self.name = restore.policy_of(loaded), run
-        state: Any = loaded.state
+        self.policy, state = restore.policy_of(loaded), cast(Any, loaded.state)
         space: Any = self.policy.obs_space
         self.head = QueryHead(self.policy.width, space["d"].W)
         for parameter, saved in zip(self.head.parameters(), state["learner"]["extra"]):
@@ -170,7 +169,7 @@ class Model:
             new = Policy(self.policy.obs_space, self.policy.action_space, **kinds, seed=99)
             statistics = dict(self.policy.named_buffers())
             new.load_state_dict({**new.state_dict(), **statistics})
-            self.policy, self.name = new, f"{run}, untrained"
+            self.policy = new
 
     @torch.no_grad()
     def features(self, one: arrdict) -> torch.Tensor:
@@ -240,13 +239,8 @@ def draw_errors(model: Model, episodes: Sequence[arrdict]) -> dict[str, tuple[fl
         apart = (apart[..., :2].norm(dim=-1) + turn).masked_fill(
             torch.arange(len(poses)) > now[:, None], torch.inf
         )
-        plan = torch.cat(
-            [
-                raycast(one["walls"], poses[then], seen.shape[-1])[:, None],
-                mean_colour[:, None].expand(len(now), 3, seen.shape[-1]),
-            ],
-            1,
-        )
+        depth = raycast(one["walls"], poses[then], seen.shape[-1])[:, None]
+        plan = torch.cat([depth, mean_colour[:, None].expand(len(now), 3, depth.shape[-1])], 1)
         drawn = {
             "model": model.draw(features[now], relative(poses[now], poses[then])),
             "repeat last view": seen[now],
@@ -356,8 +350,7 @@ def film(run: str, folder: str, file: str, number: int = 0, every: int = 4) -> N
 
     model, one = Model(run), data.load(folder)[number]
     poses, seen, features = true_poses(one), views(one.obs), model.features(one)
-    kind = os.path.splitext(file)[1][1:]
-    writer = video.WRITERS[kind][0](FPS / every * 2)
+    writer = video.WRITERS[file.rpartition(".")[2]][0](FPS / every * 2)
     around = torch.tensor([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]).float()
     turns = torch.arange(8) * (math.pi / 4)
     asked = torch.cat([around.repeat_interleave(8, 0), turns.repeat(5)[:, None]], 1)
@@ -378,5 +371,4 @@ def film(run: str, folder: str, file: str, number: int = 0, every: int = 4) -> N
             axis.scatter(*places.T, c=colours, s=2)
         writer.add(plotting.rasterise(figure))
         plt.close(figure)
-    with open(file, "wb") as output:
-        output.write(writer.close())
+    Path(file).write_bytes(writer.close())

@@ -51,8 +51,6 @@ def test_the_oracle_sees_the_walls(episodes):
 class Told:
     """A model whose features hold the answers, and that draws what there is to see."""
 
-    policy = name = None
-
     def __init__(self, episodes):
         self.views = {id(one): egomotion.views(one.obs) for one in episodes}
 
