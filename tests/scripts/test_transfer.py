@@ -60,7 +60,7 @@ def test_the_description_is_enough_to_act_as_the_policy_does(exported):
     env, policy, path = exported
     outside, world, state = RobotPolicy(path), env.reset(), policy.initial(3)
     outside.begin(seed=None)
-    assert outside.rate == 10.0
+    assert outside.about["steps_per_second"] == 10.0
     n_steps = 0
     while n_steps < 25 and not world.terminal[0]:
         n_steps += 1
@@ -76,6 +76,30 @@ def test_the_description_is_enough_to_act_as_the_policy_does(exported):
         np.testing.assert_allclose(command, expected, atol=0.02)
         world = env.step(arrdict(actions=decision.actions.detach() + torch.tensor([0.1, 0.6])))
     assert n_steps > 5
+
+
+@pytest.mark.slow
+def test_actions_are_drawn_from_the_policys_distribution(exported):
+    """Their mean is its action without draws, and their spread that of the Beta distribution."""
+    env, policy, path = exported
+    outside, seen = RobotPolicy(path), (np.full(32, 2.0), np.array([0.2, 0.5]), np.array([3, 1.0]))
+
+    def acted(seed):
+        outside.begin(seed)
+        return outside.act(*seen)
+
+    drawn, limits = np.array([acted(seed) for seed in range(600)]), [ROBOT.speed, ROBOT.turn_rate]
+    np.testing.assert_array_equal(acted(7), drawn[7])
+    world = arrdict(reset=torch.ones(1, dtype=torch.bool))
+    scan = torch.full((1, 1, 1, 1, 32), 1 - 2 / 12)
+    odom = torch.tensor([[[0.2 / 0.46, 0.5 / 1.9]]])
+    goal = torch.tensor([[[10**0.5 / 10, 3 / 10**0.5, 1 / 10**0.5]]])
+    world["obs"] = arrdict(scan=scan, odom=odom, goal=goal)
+    alpha, beta = policy(world, policy.initial(1))[0].logits[0, 0].detach().chunk(2)
+    expected = torch.distributions.Beta(alpha, beta)
+    np.testing.assert_allclose(drawn.mean(0) / limits, 2 * expected.mean - 1, atol=0.08)
+    np.testing.assert_allclose(drawn.std(0) / limits, 2 * expected.stddev, rtol=0.1)
+    np.testing.assert_allclose(acted(None) / limits, 2 * expected.mean - 1, atol=1e-4)
 
 
 @pytest.mark.slow

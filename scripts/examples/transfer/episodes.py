@@ -87,8 +87,7 @@ if __name__ == "__main__":
     parser.add_argument("--radius", type=float, default=0.17)
     words = parser.parse_args()
     try:
-        robot = dict(radius=words.radius)
-        how = words.n, words.n_homes, words.seed, robot, words.split
+        how = words.n, words.n_homes, words.seed, dict(radius=words.radius), words.split
         write(words.source, words.file, *how)
     except ValueError as error:  # no goal can be reached, a robot that fits through no door
         print(f"episodes.py: {error}", file=sys.stderr)

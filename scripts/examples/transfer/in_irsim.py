@@ -31,8 +31,6 @@ class Walls(ObstacleMap):
 class InIrsim:
     """Args: robot: the description's. steps_per_second: of the policy."""
 
-    name = "irsim"
-
     def __init__(self, robot, steps_per_second):
         self.robot, self.step_time = robot, 1 / steps_per_second
 

@@ -13,8 +13,6 @@ from megastep.dotdict import dotdict
 class InMegastep:
     """Args: robot: the description's. steps_per_second: of the policy."""
 
-    name = "megastep"
-
     def __init__(self, robot, steps_per_second):
         self.robot, self.fps = modules.Robot(**robot), steps_per_second
 

@@ -12,13 +12,7 @@ HEIGHT = 0.2  # of the lidar above the axle
 MODEL = """
 <mujoco>
   <option timestep="0.004" integrator="implicitfast"/>
-  <visual>
-    <global offwidth="640" offheight="640"/>
-    <headlight ambient=".45 .45 .45" diffuse=".4 .4 .4"/>
-  </visual>
-  <asset>
-    <texture type="skybox" builtin="gradient" rgb1=".8 .85 .9" rgb2="1 1 1" width="64" height="64"/>
-  </asset>
+  <visual><headlight ambient=".45 .45 .45" diffuse=".4 .4 .4"/></visual>
   <worldbody>
     <light pos="{middle} 6" dir="0 0 -1" directional="true" diffuse=".5 .5 .5"/>
     <geom type="plane" size="0 0 .1" rgba=".86 .84 .8 1" friction="1 .005 .0001"/>
@@ -54,8 +48,6 @@ FOV = math.radians(130)
 
 class InMujoco:
     """Args: robot: the description's. steps_per_second: of the policy."""
-
-    name = "mujoco"
 
     def __init__(self, robot, steps_per_second):
         self.robot, self.seconds = robot, 1 / steps_per_second

@@ -121,7 +121,7 @@ def spin(node):
         message.twist.linear.x, message.twist.angular.z = float(speed), float(turn)
         commands.publish(message)
 
-    ros.create_timer(1 / node.policy.rate, send)
+    ros.create_timer(1 / node.policy.about["steps_per_second"], send)
     rclpy.spin(ros)
 
 

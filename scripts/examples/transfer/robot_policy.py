@@ -42,11 +42,6 @@ class RobotPolicy:
         self.limits = np.array(self.about["actions"]["high"])
         self.begin()
 
-    @property
-    def rate(self) -> float:
-        """Actions per second."""
-        return self.about["steps_per_second"]
-
     def begin(self, seed: int | None = 1) -> None:
         """Forgets, at the start of an episode. A seed is that of the actions, which are drawn from
         a Beta distribution; None: takes its mean.

@@ -94,7 +94,7 @@ def main():
     figure, panels = pyplot.subplots(
         1, n_panels, figsize=(3.2 * n_panels, 3.6), dpi=100, layout="constrained", squeeze=False
     )
-    writer = WRITERS[Path(words.film).suffix](policy.rate)
+    writer = WRITERS[Path(words.film).suffix](policy.about["steps_per_second"])
     for step in range(0, max(len(run[0]) for run in runs.values()) + 5, words.every):
         for axes, (name, (poses, scans, _, _, _)) in zip(panels[0], runs.items()):
             scan, radius = scans[min(step, len(scans) - 1)], policy.about["robot"]["radius"]
