@@ -33,6 +33,7 @@ FILMS = {
     "pointgoal.png": "run=pointgoal_anywhere home=4 steps=30",
     "homes.png": "run=pointgoal_anywhere homes=[1,2,3,4] steps=25 theme=dark dpi=70",
     "deathmatch.png": "run=deathmatch_anywhere against=hunter home=27 steps=60",
+    "hideandseek.png": "env=hideandseek seed=101 steps=104 dpi=70",
     "memory.gif": "run=memory_9 steps=160 dpi=60 speed=2 seed=2",
     "keys.png": "run=keys_anywhere steps=60",
     "minimal.png": "env=minimal geometry=box steps=20",
@@ -65,6 +66,7 @@ FILMS |= {
 MOVING = {
     "pointgoal.mp4": "run=pointgoal_anywhere home=4 steps=160 dpi=70 speed=2",
     "deathmatch.mp4": "run=deathmatch_anywhere against=hunter home=27 steps=160 dpi=70 speed=2",
+    "hideandseek.mp4": "env=hideandseek seed=101 steps=160 dpi=70 speed=2",
     "keys.mp4": "run=keys_anywhere steps=160 dpi=70 speed=2",
     "minimal.mp4": "env=minimal geometry=box steps=100 dpi=80",
     "pong-court.mp4": "run=PONG steps=200 dpi=80",

@@ -1,6 +1,7 @@
 """Composing and checking configurations. No test starts a run."""
 
 import dataclasses
+import itertools
 import logging
 import operator
 import re
@@ -47,6 +48,9 @@ def test_every_group_member_composes():
     assert set(groups["geometry"]) == set(geometries.SOURCES)
     for choice in [f"{group}={member}" for group in groups for member in groups[group]]:
         assert isinstance(composer.settings([choice, *MORE.get(choice, ())]), Train)
+    needed = {"record": [], "evaluate": ["run=x"], "dump": ["run=x", "folder=y"]}
+    for name, env in itertools.product(needed, groups["env"]):
+        assert Composer(load(name)).settings([f"env={env}", *needed[name]]).env
 
 
 def test_settings_round_trip():
