@@ -48,9 +48,8 @@ def run(cfg: settings.Dump) -> Path:
     has other files, or the disk is too small; nothing is half-written.
     """
     folder, device = Path(cfg.folder), factory.make_device(cfg.device)
-    if cfg.format != "npz":
-        with user_errors(kinds=(data.DatasetError,)):
-            formats.require(cfg.format)
+    with user_errors(kinds=(data.DatasetError,)):
+        formats.require(cfg.format)
     loaded, env_settings, geometry = None, cfg.env, cfg.geometry
     if cfg.run is not None:
         loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
@@ -67,12 +66,13 @@ def run(cfg: settings.Dump) -> Path:
         _claim(folder, about)
         staged = folder if cfg.format == "npz" else folder / STAGED
         with folders.locked(folder), _tidied(folder, staged):
-            if cfg.format == "npz" or not formats.is_there(cfg.format, folder):
+            if cfg.format == "npz":
+                waves.write(folder)
+            elif not formats.is_there(cfg.format, folder):
                 staged.mkdir(exist_ok=True)
                 waves.write(staged)
-                if cfg.format != "npz":
-                    write_atomically(staged / data.ABOUT, _text({**about, "format": "npz"}))
-                    formats.convert(cfg.format, data.load(staged), folder, console.count)
+                write_atomically(staged / data.ABOUT, _text({**about, "format": "npz"}))
+                formats.convert(cfg.format, data.load(staged), folder, console.count)
             if cfg.format != "npz":
                 delete(staged)
     said = f"{cfg.episodes:,} episodes are in {folder}"

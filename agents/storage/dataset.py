@@ -71,14 +71,13 @@ class DatasetCollector:
             self.n_taken = self.n_taken + is_over.sum()
             rows.append(self.row)
         index = torch.stack(rows)
-        leaves = {"obs": spaces.leaves(rollout.obs, "obs")}
-        leaves["actions"] = spaces.leaves(rollout.actions, "actions")
+        leaves = spaces.leaves({"obs": rollout.obs, "actions": rollout.actions})
         for path, name in self.codec.names.items():
             if path.startswith("obs"):
                 found = self.codec.decode(path, self.columns[name][index], n_axes=2)
-                leaves["obs"][path].copy_(found)
             else:  # a row has the action that led there
-                leaves["actions"][path].copy_(self.columns[name][index[1:]])
+                found = self.columns[name][index[1:]]
+            leaves[path].copy_(found)
         for name in episodes.OUTCOMES:
             getattr(rollout, name).copy_(self.columns[name][index[1:]])
         rollout.starts.copy_(self.columns["starts"][index])

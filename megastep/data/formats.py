@@ -31,7 +31,7 @@ Progress = Callable[[int, int], None]
 
 def require(format: str) -> None:
     """Raises DatasetError if a package is missing."""
-    if absent := [name for name in NEEDED[format] if importlib.util.find_spec(name) is None]:
+    if absent := [name for name in NEEDED.get(format, ()) if not importlib.util.find_spec(name)]:
         raise DatasetError(
             f"format={format} needs {', '.join(absent)}: pip install 'megastep-flatland[{format}]'"
         )

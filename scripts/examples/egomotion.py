@@ -155,14 +155,14 @@ class Frozen(PPO):
 
 
 class Model:
-    """A run's core and head. `untrained`: the core before training, and no head that draws."""
+    """A run's core, and the head that draws. `untrained`: the core before training."""
 
     def __init__(self, run: str, untrained: bool = False):
         loaded = folders.load_checkpoint(folders.find(run), True, "cpu", is_whole=True)
         self.policy, state = restore.policy_of(loaded), cast(Any, loaded.state)
         space: Any = self.policy.obs_space
-        self.head = QueryHead(self.policy.width, space["d"].W)
-        for parameter, saved in zip(self.head.parameters(), state["learner"]["extra"]):
+        self.draw = QueryHead(self.policy.width, space["d"].W).requires_grad_(False)
+        for parameter, saved in zip(self.draw.parameters(), state["learner"]["extra"]):
             parameter.data.copy_(saved)
         if untrained:
             kinds: Any = self.policy.settings
@@ -178,11 +178,6 @@ class Model:
         starts[0] = True
         obs = one.obs.map(lambda leaf: leaf[:, None])
         return self.policy.unroll(obs, starts, self.policy.initial(1))["features"][:, 0].float()
-
-    @torch.no_grad()
-    def draw(self, features: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
-        """Returns views (..., 4, P)."""
-        return self.head(features, pose)
 
 
 def true_poses(one: arrdict) -> torch.Tensor:
