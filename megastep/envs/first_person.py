@@ -185,8 +185,8 @@ class FirstPerson(SceneryEnv):
         if self._resets.mask is not None:
             mask = modules.to_agents(self._resets.mask, self.n_agents)
             kept = dict(only=mask, out=parts["view"])
-        core = self.core.scenery, self.core.agents
-        parts["view"] = engine.observe(*core, self.subsample, imu=True, **seen, **kept)
+        scenery, agents = self.core.scenery, self.core.agents
+        parts["view"] = engine.observe(scenery, agents, self.subsample, imu=True, **seen, **kept)
         return parts["view"]
 
     def truth(self) -> arrdict:
