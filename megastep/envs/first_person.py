@@ -179,15 +179,13 @@ class FirstPerson(SceneryEnv):
 
     def _view(self, core: Core | None = None, **seen: Any) -> engine.Observation:
         """Returns what all cameras see, or those of a core. ``seen``: as ``engine.observe``."""
-        if core is not None:
-            return engine.observe(core.scenery, core.agents, self.subsample, imu=True, **seen)
-        parts, kept = self._resets.parts, {}
-        if self._resets.mask is not None:
-            mask = modules.to_agents(self._resets.mask, self.n_agents)
-            kept = dict(only=mask, out=parts["view"])
-        scenery, agents = self.core.scenery, self.core.agents
-        parts["view"] = engine.observe(scenery, agents, self.subsample, imu=True, **seen, **kept)
-        return parts["view"]
+        parts, mask, of = self._resets.parts, self._resets.mask, core or self.core
+        if core is None and mask is not None:
+            seen |= dict(only=modules.to_agents(mask, self.n_agents), out=parts["view"])
+        view = engine.observe(of.scenery, of.agents, self.subsample, imu=True, **seen)
+        if core is None:
+            parts["view"] = view
+        return view
 
     def truth(self) -> arrdict:
         """Returns what no agent observes, (B, ...) float32: ``agent_pos`` (2), metres;
