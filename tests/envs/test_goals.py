@@ -67,6 +67,7 @@ def step(c, goals, goal_index, spawn_index=None, **settings):
         **dict(limit=500, seed=1, privileged_space=True) | settings,
         weights=Coefficients(c.device, bonus=5.0, cost=0.02, walk_cost=0.0),
         spawner=SimpleNamespace(point_index=spawn_index),
+        _resets=engine.Resets(),
         goal_index=goal_index.flatten().clone(),
         progress=torch.zeros((PROGRESS_ROWS, n), **on),
         ages=torch.zeros(n, dtype=torch.int32, **on),
