@@ -114,10 +114,9 @@ class BC(learner.GradientLearner):
         with policy.compute_dtype():
             now = policy.unroll(*sequence, mask=without_last(batch.get("mask")))
             logprobs, entropies = policy.output.terms(now.logits, batch.actions)
-            metrics = dict(
-                policy=-masked_mean(logprobs, valid), entropy=masked_mean(entropies, valid)
-            )
-            loss = self.coefficients["policy_coef"] * metrics["policy"]
+            nll, entropy = -masked_mean(logprobs, valid), masked_mean(entropies, valid)
+            metrics = dict(policy=nll, entropy=entropy)
+            loss = self.coefficients["policy_coef"] * nll
             if policy.critic is not None:
                 error = (policy.value(now.features) - batch.targets) / policy.critic.output.scale
                 metrics["value"] = masked_mean(error.square(), valid)

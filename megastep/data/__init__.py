@@ -97,9 +97,7 @@ class Episodes(Dataset):
 
 
 def load(folder: str | os.PathLike) -> Episodes:
-    """Returns the dataset of a folder: `megastep.data.load("folder")`. DatasetError if it is none
-    of npz files that `megastep dump` has written, or is not complete.
-    """
+    """Returns the dataset of a folder. Raises DatasetError as `Episodes` does."""
     return Episodes(folder)
 
 

@@ -185,12 +185,10 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     parts += [directory, struct.pack(_END, b"PK\5\6", 0, 0, n, n, len(directory), offset, 0)]
     temporary = f"{path}.tmp"
     try:
-        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-        try:  # at once, as threads wait for one another between calls
-            if os.writev(handle, parts) < sum(map(len, parts)):
+        with open(temporary, "wb", buffering=0) as file:
+            # at once, as threads wait for one another between calls
+            if os.writev(file.fileno(), parts) < sum(map(len, parts)):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        finally:
-            os.close(handle)
         os.replace(temporary, path)
     except BaseException:
         delete(Path(temporary))

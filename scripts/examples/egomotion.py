@@ -231,9 +231,8 @@ def draw_errors(model: Model, episodes: Sequence[arrdict]) -> dict[str, tuple[fl
         poses, seen, features = true_poses(one), views(one.obs), model.features(one)
         apart = relative(poses[None, :], poses[then][:, None])
         turn = torch.atan2(apart[..., 2].sin(), apart[..., 2].cos()).abs().rad2deg() / TURN
-        apart = (apart[..., :2].norm(dim=-1) + turn).masked_fill(
-            torch.arange(len(poses)) > now[:, None], torch.inf
-        )
+        unseen = torch.arange(len(poses)) > now[:, None]
+        apart = (apart[..., :2].norm(dim=-1) + turn).masked_fill(unseen, torch.inf)
         depth = raycast(one["walls"], poses[then], seen.shape[-1])[:, None]
         plan = torch.cat([depth, mean_colour[:, None].expand(len(now), 3, depth.shape[-1])], 1)
         drawn = {
@@ -280,10 +279,8 @@ def probe(model: Model, episodes: Sequence[arrdict], every: int = 5) -> dict[str
             target.append(frame(one)[1] * one["targets_vec"][rows].flatten(1))
         parts.append((model.features(one)[rows], torch.cat(target, 1)))
     half = len(parts) // 2
-    (x, y), (x_test, y_test) = (
-        [torch.cat(columns).double() for columns in zip(*some)]
-        for some in (parts[:half], parts[half:])
-    )
+    halves = parts[:half], parts[half:]
+    (x, y), (x_test, y_test) = ([torch.cat(p).double() for p in zip(*some)] for some in halves)
     mean, scale = x.mean(0), x.std(0) + 1e-3
     x, x_test = ((torch.cat([(z - mean) / scale, z.new_ones(len(z), 1)], 1)) for z in (x, x_test))
     ridge = 1e-3 * len(x) * torch.eye(x.shape[1]).double()
