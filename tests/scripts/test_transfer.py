@@ -60,7 +60,7 @@ def test_the_description_is_enough_to_act_as_the_policy_does(exported):
     env, policy, path = exported
     outside, world, state = RobotPolicy(path), env.reset(), policy.initial(3)
     outside.begin(seed=None)
-    assert outside.about["steps_per_second"] == 10.0
+    assert (outside.about["steps_per_second"], outside.about["limit"]) == (10.0, 500)
     n_steps = 0
     while n_steps < 25 and not world.terminal[0]:
         n_steps += 1
