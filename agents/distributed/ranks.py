@@ -88,9 +88,9 @@ class Ranks(NamedTuple):
         tensors |= {f"extra.{i}": tensor for i, tensor in enumerate(extra)}
         rows = all_gather(checksums(tensors.values())).T.tolist()
         for name, sums in zip(tensors, rows, strict=True):
-            if different := ", ".join(str(n) for n, one in enumerate(sums) if one != sums[0]):
+            if different := [f"rank {n}" for n, one in enumerate(sums) if one != sums[0]]:
                 raise DriftError(
-                    f"The ranks drift apart: policy.{name} differs on rank {different}; "
+                    f"The ranks drift apart: policy.{name} differs on {', '.join(different)}; "
                     "start all with the same options and packages; a learner of your own averages "
                     "gradients with megastep.agents.distributed.pooling.average_gradients"
                 )

@@ -153,6 +153,6 @@ def test_first_difference_names_tensor_and_ranks(monkeypatch):
         return rows
 
     monkeypatch.setattr(ranks, "all_gather", gather)
-    text = "policy.0.bias differs on ranks 1 and 2; .*average_gradients"
+    text = "policy.0.bias differs on rank 1, rank 2; .*average_gradients"
     with pytest.raises(ranks.DriftError, match=text):
         Ranks(0, 3).check_drift(network)
