@@ -25,6 +25,7 @@ train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen hom
 test: $(SETUP)             ## run the fast tests: 4 to 5 minutes on two cores
 	$(PYTEST)
 
+test-slow: WORKERS := $(shell expr $(CORES) + 2)
 test-slow: $(SETUP)        ## run the thorough tests: 3 to 4 minutes; .ci/run runs them as well
 	$(PYTEST) -m slow
 

@@ -57,7 +57,7 @@ def pytest_collection_modifyitems(config, items):
 def pytest_ignore_collect(collection_path, config):
     """Imports no file without tests of the tier that is chosen."""
     tier = config.option.markexpr
-    if tier in ("slow", "nightly") and collection_path.name.startswith("test_"):
+    if tier in ("slow", "nightly") and collection_path.match("test_*.py"):
         return f"mark.{tier}" not in collection_path.read_text() or None
 
 

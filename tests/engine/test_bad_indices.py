@@ -83,15 +83,14 @@ def main(kernels):
         if kernels == "cuda-on-cpu":
             CudaOnCpu().install(patch)
         for name in ENVS:
-            values = VALUES[:2] if kernels == "cuda-on-cpu" else VALUES
-            attack(name, "cuda" if kernels == "cuda" else "cpu", values)
+            attack(name, "cuda" if kernels == "cuda" else "cpu", VALUES)
 
 
 @pytest.mark.parametrize(
     "kernels",
     [
         "cpu",
-        pytest.param("cuda-on-cpu", marks=pytest.mark.slow),
+        pytest.param("cuda-on-cpu", marks=pytest.mark.nightly),
         pytest.param("cuda", marks=pytest.mark.cuda),
     ],
 )

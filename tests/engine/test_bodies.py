@@ -310,8 +310,8 @@ def slots_of(scenery, agents, e, wish):
     [
         ("box", 4, 12),
         ("ramps", 4, 24),
-        pytest.param("box", 10, 24, marks=pytest.mark.slow),
-        pytest.param("ramps", 8, 30, marks=pytest.mark.slow),
+        pytest.param("box", 10, 24, marks=pytest.mark.nightly),
+        pytest.param("ramps", 8, 30, marks=pytest.mark.nightly),
     ],
 )
 def test_a_step_is_the_twins(source, n_envs, n_steps):
