@@ -62,6 +62,7 @@ class CudaGraphUpdate:
         return dict(zip(self._names, self._output.clone().unbind())) if self._names else {}
 
     def _recorded(self, rollout) -> torch.cuda.CUDAGraph:
+        assert self.stream is not None
         graph = torch.cuda.CUDAGraph()
         for generator in self.generators:
             graph.register_generator_state(generator.on(self.device))
