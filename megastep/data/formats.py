@@ -133,8 +133,10 @@ def _lerobot(source, folder, progress) -> None:
     import pyarrow as pa  # pyright: ignore[reportMissingImports]
     import pyarrow.parquet as pq  # pyright: ignore[reportMissingImports]
 
-    writer, features, stats, rows = None, {}, _Stats(), []
-    size, file_number, n_frames, fps = 0, 0, 0, round(source.about["fps"])
+    writer, list_writer, features, sums, rows = None, None, {}, {}, []
+    path_of_list = folder / "meta" / "episodes" / _FILE.format(chunk_index=0, file_index=0)
+    path_of_list.parent.mkdir(parents=True)
+    size, file_number, n_frames, fps = 0, 0, 0, source.about["fps"]
     for number, arrays in enumerate(_each(source, progress)):
         frames = _frames(source, arrays)
         n = len(arrays["reward"])
@@ -142,7 +144,10 @@ def _lerobot(source, folder, progress) -> None:
         frames |= {"timestamp": (order / fps).astype(np.float32), "frame_index": order}
         frames |= {"episode_index": np.full(n, number), "index": order + n_frames}
         frames["task_index"] = np.zeros(n, np.int64)
-        stats.add(frames)
+        own = _sums(frames)
+        for name, values in own.items():
+            old = sums.get(name)
+            sums[name] = [f(*two) for f, *two in zip(JOINED, old, values)] if old else values
         columns = {name: _column(pa, array) for name, array in frames.items()}
         table = pa.table(columns)
         if writer is not None and size > FILE_BYTES:
@@ -158,21 +163,27 @@ def _lerobot(source, folder, progress) -> None:
         row = dict(episode_index=number, tasks=[source.label], length=n)
         row |= {f"data/{key}": value for key, value in place.items()}
         row |= dict(dataset_from_index=n_frames, dataset_to_index=n_frames + n)
-        rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        for name, values in _stats(own).items():
+            row |= {f"stats/{name}/{key}": value for key, value in values.items()}
+        rows.append(row)
+        if len(rows) == PER_CHUNK or number + 1 == len(source):
+            table, rows = pa.Table.from_pylist(rows), []
+            list_writer = list_writer or pq.ParquetWriter(path_of_list, table.schema)
+            list_writer.write_table(table)
         n_frames += n
         features = features or {name: _feature(array) for name, array in frames.items()}
-    assert writer is not None
+    assert writer is not None and list_writer is not None
     writer.close()
+    list_writer.close()
     meta = folder / "meta"
-    path = meta / "episodes" / _FILE.format(chunk_index=0, file_index=0)
-    path.parent.mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist(rows), path)
     pd.DataFrame({"task_index": [0]}, index=[source.label]).to_parquet(meta / "tasks.parquet")
-    (meta / "stats.json").write_text(json.dumps(stats.result(), indent=1))
-    about: dict[str, Any] = dict(codebase_version="v3.0", robot_type="megastep", fps=fps)
-    about |= dict(total_episodes=len(rows), total_frames=n_frames, total_tasks=1)
+    (meta / "stats.json").write_text(json.dumps(_stats(sums), indent=1))
+    rate = int(fps) if fps == int(fps) else fps
+    about: dict[str, Any] = dict(codebase_version="v3.0", robot_type="megastep", fps=rate)
+    about |= dict(total_episodes=len(source), total_frames=n_frames, total_tasks=1)
     about |= dict(chunks_size=PER_CHUNK, data_files_size_in_mb=FILE_BYTES // 2**20)
-    about |= dict(video_files_size_in_mb=200, splits={"train": f"0:{len(rows)}"}, video_path=None)
+    about |= dict(video_files_size_in_mb=200, splits={"train": f"0:{len(source)}"}, video_path=None)
     about |= dict(data_path=f"data/{_FILE}", features=features)
     (meta / "info.json").write_text(json.dumps(about, indent=1))
 
@@ -229,31 +240,31 @@ def _feature(array) -> dict[str, Any]:
     return dict(dtype=str(array.dtype), shape=array.shape[1:] or (1,), names=None)
 
 
-class _Stats:
-    """Minimum, maximum, mean and standard deviation of each feature, as LeRobot keeps them."""
+#: How sums of episodes are joined: minimum, maximum, sum, sum of squares, numbers, frames.
+JOINED = np.minimum, np.maximum, np.add, np.add, np.add, np.add
 
-    JOINED = np.minimum, np.maximum, np.add, np.add, np.add
 
-    def __init__(self) -> None:
-        self.sums: dict[str, list[np.ndarray]] = {}
+def _sums(frames) -> dict[str, list[np.ndarray]]:
+    """Returns what the statistics of an episode's features are made of."""
+    found = {}
+    for name, array in frames.items():
+        values = array.reshape(len(array), -1).astype(np.float64)
+        if array.ndim == 4:
+            values = array.reshape(-1, array.shape[-1]) / 255
+        found[name] = [values.min(0), values.max(0), values.sum(0), np.square(values).sum(0)]
+        found[name] += [np.array([len(values)]), np.array([len(array)])]
+    return found
 
-    def add(self, frames: dict[str, np.ndarray]) -> None:
-        for name, array in frames.items():
-            values = array.reshape(len(array), -1).astype(np.float64)
-            if array.ndim == 4:
-                values = array.reshape(-1, array.shape[-1]) / 255
-            new = [values.min(0), values.max(0), values.sum(0), np.square(values).sum(0)]
-            new.append(np.array([len(values)]))
-            old = self.sums.get(name)
-            self.sums[name] = [f(*two) for f, *two in zip(self.JOINED, old, new)] if old else new
 
-    def result(self) -> dict[str, dict[str, Any]]:
-        found = {}
-        for name, (low, high, total, squares, count) in self.sums.items():
-            mean = total / count
-            std = np.sqrt(np.maximum(squares / count - mean**2, 0))
-            shape = (3, 1, 1) if name == "observation.image" else (-1,)
-            values = dict(min=low, max=high, mean=mean, std=std)
-            found[name] = {key: value.reshape(shape).tolist() for key, value in values.items()}
-            found[name]["count"] = count.tolist()
-        return found
+def _stats(sums) -> dict[str, dict[str, Any]]:
+    """Returns minimum, maximum, mean and standard deviation of each feature, as LeRobot keeps them,
+    and its number of frames.
+    """
+    found = {}
+    for name, (low, high, total, squares, n, count) in sums.items():
+        std = np.sqrt(np.maximum(squares / n - (total / n) ** 2, 0))
+        shape = (3, 1, 1) if name == "observation.image" else (-1,)
+        values = dict(min=low, max=high, mean=total / n, std=std)
+        found[name] = {key: value.reshape(shape).tolist() for key, value in values.items()}
+        found[name]["count"] = count.tolist()
+    return found

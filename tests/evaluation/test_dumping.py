@@ -1,5 +1,6 @@
 """Datasets that `megastep dump` writes, and what reads them back."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -343,6 +344,31 @@ def test_minari_reads_every_array(twice, monkeypatch):
         assert np.array_equal(one.infos["walls"], file["walls"])
 
 
+def test_lerobot_has_half_frames_a_second_and_statistics_of_each_episode(tmp_path, few):
+    pandas = pytest.importorskip("pandas")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    words = *HOMES, "env.fps=2.5", "max_steps=7"
+    npz, folder = dumped(tmp_path / "npz", *words), tmp_path / "lerobot"
+    dumped(folder, *words, "format=lerobot")
+    files = [np.load(path) for path in data.load(npz).files]
+    frames = pandas.read_parquet(folder / "data")
+    assert np.allclose(frames.timestamp, frames.frame_index / 2.5)
+    assert json.loads((folder / "meta/info.json").read_text())["fps"] == 2.5
+    rows = parquet.read_table(folder / "meta/episodes").to_pylist()
+    whole = json.loads((folder / "meta/stats.json").read_text())
+    for name, scale in ("imu", 1), ("image", 255):
+        numbers = [file[name] / scale for file in files]
+        assert whole[f"observation.{name}"]["count"] == [sum(map(len, numbers))]  # no pixels
+        numbers = [one.reshape(-1, one.shape[-1]) for one in numbers]
+        mean = np.ravel(whole[f"observation.{name}"]["mean"])
+        assert np.allclose(mean, np.concatenate(numbers).mean(0, np.float64))
+        for i in (0, 9):  # LeRobot computes from these what is left after delete_episodes
+            assert rows[i][f"stats/observation.{name}/count"] == [len(files[i]["reward"])]
+            for key in "min", "max", "mean", "std":
+                own = np.ravel(rows[i][f"stats/observation.{name}/{key}"])
+                assert np.allclose(own, getattr(numbers[i].astype(np.float64), key)(0)), key
+
+
 READ = """
 import sys, numpy, torch
 # torchvision's operators are not there without its own build of torch, and are not used
@@ -358,6 +384,9 @@ arrays = {key: torch.stack([row[key] for row in rows]).numpy() for key in keys}
 pair = LeRobotDataset("local/dataset", root=sys.argv[1], delta_timestamps={"action": [0, 0.1]})
 arrays["pair"] = torch.stack([pair[i]["action"] for i in range(3)]).numpy()
 arrays |= {f"mean {key}": value["mean"] for key, value in dataset.meta.stats.items()}
+from lerobot.datasets.dataset_tools import delete_episodes
+fewer = delete_episodes(dataset, [1], output_dir="fewer", repo_id="local/fewer")
+arrays |= {f"fewer {key}": value["mean"] for key, value in fewer.meta.stats.items()}
 numpy.savez(sys.argv[2], **arrays)
 """
 #: LeRobot's own requirements, without torch, which is this environment's.
@@ -399,6 +428,8 @@ def test_lerobot_reads_every_array(twice, lerobot, tmp_path):
         assert np.array_equal(read[f"observation.{name}"], rows.astype(np.float32))
         # float32 and float64, and LeRobot's file has all digits
         assert np.allclose(read[f"mean observation.{name}"], rows.mean(0, np.float64), atol=1e-6)
+        fewer = rows[np.r_[:13, 26:39]].mean(0, np.float64)
+        assert np.allclose(read[f"fewer observation.{name}"], fewer, atol=1e-6)
     for name, key in ("action", "action"), ("reward", "next.reward"), ("truncated", "next.done"):
         rows = [np.concatenate([file[name][1:], 0 * file[name][:1]]) for file in files]
         assert np.array_equal(read[key], np.concatenate(rows)), name
