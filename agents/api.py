@@ -146,8 +146,8 @@ def make(env: object, privileged: bool = False, **settings_of_env: object) -> "E
         for key, value in settings_of_env.items()
     }
     cfg = _settings("record", {"env": env, "split": "training", **arguments})
-    geometry = cfg.geometry or components.settings_for("geometry", components.HOMES)
-    device, homes = factory.make_device(cfg.device), factory.homes(cfg.env, geometry, cfg.split)
+    _, geometry, homes = factory.played_in(cfg)
+    device = factory.make_device(cfg.device)
     if device.type == "cpu":
         factory.share_threads(1)
     where = dict(seed=cfg.seed, device=device, privileged=privileged)

@@ -7,12 +7,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
-import torch
-
-from megastep.coefficients import Coefficients
 from megastep.types import Env, PolicyLike
+
+if TYPE_CHECKING:  # commands begin without PyTorch
+    import torch
+
+    from megastep.coefficients import Coefficients
 
 #: What an object saves: tensors and plain values by name, in nested dicts and lists.
 StateDict = dict[str, Any]
@@ -22,7 +24,7 @@ Config = dict[str, Any]
 Row = dict[str, Any]
 #: Number of entries, their mean and their variance; () or, for several quantities, mean and
 #: variance of one shape.
-Moments = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+Moments = tuple["torch.Tensor", "torch.Tensor", "torch.Tensor"]
 T = TypeVar("T")
 
 

@@ -3,15 +3,12 @@
 import datetime
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megastep.agents import console
 from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError
 from megastep.agents.runs import agent_file, checkpoint, folders
-
-if TYPE_CHECKING:
-    from megastep.agents.types import StateDict
+from megastep.agents.types import StateDict
 
 HELP = """Verifies a run's checkpoints and prints what is in them.
 
@@ -69,7 +66,7 @@ def _lines_of_agent(path: Path) -> Iterator[str]:
         yield f"  {table['title']}: {len(table['rows'])} rows"
 
 
-def _parts(state: "StateDict | None") -> Iterator[str]:
+def _parts(state: StateDict | None) -> Iterator[str]:
     """Yields a line for each part of a state."""
     from torch.utils._pytree import tree_leaves
 

@@ -22,7 +22,7 @@ import uuid
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import hydra
 from hydra.core import global_hydra
@@ -39,10 +39,8 @@ from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, rank, signals
 from megastep.agents.launch.again import AUTO
 from megastep.agents.runs import folders, scores
+from megastep.agents.types import Row
 from megastep.atomic_files import write_atomically
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
 #: What the score of a job is, unless `metric=` says otherwise.
@@ -231,7 +229,7 @@ class Job:
         scores = [row.get("score") for row in rows]
         return None if None in scores else sum(scores) / len(scores)
 
-    def run_once(self, row: "Row", words: list[str], is_joblib: bool) -> "Row":
+    def run_once(self, row: Row, words: list[str], is_joblib: bool) -> Row:
         """Runs a job unless a cluster starts it again and it is done. Returns its row. A job of
         joblib has a process of its own, so that one that is killed leaves the others.
         """
@@ -255,7 +253,7 @@ class Job:
             console.say(f"Job {number} {LOST}", sys.stderr)
         return ended
 
-    def run(self, row: "Row", words: list[str], is_again: bool = False) -> "Row":
+    def run(self, row: Row, words: list[str], is_again: bool = False) -> Row:
         """Runs a job in this process, from its checkpoint if it is started again."""
         began, number, result = time.monotonic(), row["number"], None
         if os.getpid() != self.process:  # its lines are among those of others
@@ -303,14 +301,14 @@ class Job:
         resume, folder = AUTO if is_again else cfg.resume, os.path.relpath(folder)
         return settings.changed(cfg, logger=loggers, folder=folder, resume=resume)
 
-    def record(self, row: "Row") -> None:
+    def record(self, row: Row) -> None:
         """Writes what is known of a job, and the table of all jobs so far."""
         with contextlib.suppress(OSError):  # a full disk: the job is worth more
             path = Path(self.records, f"{row['number']}.json")
             write_atomically(path, json.dumps(row).encode())
             write_table(Path(self.folder), [*self.rows().values()])
 
-    def rows(self) -> "dict[int, Row]":
+    def rows(self) -> dict[int, Row]:
         """Returns what the jobs of this sweep recorded, by number, in order."""
         rows = [json.loads(path.read_text()) for path in Path(self.records).glob("*.json")]
         return {row["number"]: row for row in sorted(rows, key=lambda row: row["number"])}
@@ -346,7 +344,7 @@ def run_job(text: str) -> None:
 # ---- The table ----
 
 
-def write_table(folder: Path, rows: "list[Row]", is_printed: bool = False) -> None:
+def write_table(folder: Path, rows: list[Row], is_printed: bool = False) -> None:
     """Writes sweep.md, the table as it is printed, and sweep.csv, with all digits and folders."""
     rows = [row | row["varied"] | {"job": row["number"]} for row in rows]
     head = ["job", *dict.fromkeys(key for row in rows for key in row["varied"]), *COLUMNS]

@@ -22,7 +22,7 @@ from megastep import data, spaces
 from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import eval_env, playing
-from megastep.agents.factory import check, components, env_failures, settings
+from megastep.agents.factory import check, env_failures, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.runs import checkpoint, folders, restore
@@ -50,15 +50,10 @@ def run(cfg: settings.Dump) -> Path:
     folder, device = Path(cfg.folder), factory.make_device(cfg.device)
     with user_errors(kinds=(data.DatasetError,)):
         formats.require(cfg.format)
-    loaded, env_settings, geometry = None, cfg.env, cfg.geometry
+    loaded = None
     if cfg.run is not None:
         loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
-        trained = factory.config_of(loaded)
-        env_settings = cfg.env or trained.env
-        geometry = factory.typed_or(trained.geometry, geometry, env_settings)
-    env_settings = cast("settings.Env", env_settings)
-    geometry = geometry or components.settings_for("geometry", components.HOMES)
-    homes = factory.homes(env_settings, geometry, cfg.split)
+    env_settings, geometry, homes = factory.played_in(cfg, loaded)
     env_settings = settings.changed_known(env_settings, resample=True)
     with env_failures.caught(env_settings, Path()):
         waves = Waves(cfg, env_settings, homes, loaded, device)

@@ -13,8 +13,8 @@ from megastep.agents.distributed import process_group
 from megastep.agents.distributed.shard import Shard
 from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing
+from megastep.agents.factory import components, settings
 from megastep.agents.factory import make as factory
-from megastep.agents.factory import settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.selfplay.bots import BOTS
@@ -172,7 +172,7 @@ def name_of(loaded: checkpoint.Checkpoint) -> str:
 
 def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpoint) -> Player:
     """Returns the player of a checkpoint, to meet the agent of `run` in `env`, or UserError."""
-    trained, own = (settings.label(factory.config_of(one).env.name) for one in (loaded, run))
+    trained, own = (components.label(factory.config_of(one).env.name) for one in (loaded, run))
     if trained != own:
         raise UserError(
             f"{loaded.path} was trained in {trained} and {run.path} in {own}; choose a run in the "

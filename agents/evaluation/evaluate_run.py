@@ -2,7 +2,6 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megastep.agents import console
 from megastep.agents.distributed import process_group
@@ -11,10 +10,8 @@ from megastep.agents.evaluation.eval_env import EvalEnv, Player
 from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.runs import checkpoint, folders, restore
+from megastep.agents.types import Row
 from megastep.types import optional
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
 
 ORACLE = "oracle"  # the bot that knows where everything is
 
@@ -32,10 +29,7 @@ def run(cfg: settings.Evaluate) -> Path:
     """
     start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
-    trained = factory.config_of(loaded)
-    env_settings = cfg.env or trained.env
-    geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
-    homes = factory.homes(env_settings, geometry, cfg.split)
+    env_settings, geometry, homes = factory.played_in(cfg, loaded)
     folder, rank = folders.folder_of(loaded.path), process_group.rank()
     options: dict = dict(episodes=cfg.episodes, seed=cfg.seed, device=device)
     options["is_duel"] = cfg.ratings or cfg.against is not None
@@ -82,7 +76,7 @@ def _measure(cfg, loaded, env_settings, geometry, homes, options) -> Path:
     return tables.write_table(cfg, loaded, names, title, rows, differences, episodes)
 
 
-def _duel(cfg, loaded, where, source, _) -> "tuple[list[Row], list[Row], list[Row]]":
+def _duel(cfg, loaded, where, source, _) -> tuple[list[Row], list[Row], list[Row]]:
     """Plays the run's agent against each of `cfg.against`. Returns the rows of the table."""
     agent, rows = eval_env.load_player(loaded, where.sample, loaded), []
     for opponent in where.players(cfg.against, loaded, cfg.trust):
@@ -97,7 +91,7 @@ def _play(
     where: EvalEnv,
     source: str | None,
     numbers: list[int],
-) -> "tuple[list[Row], list[Row], list[Row]]":
+) -> tuple[list[Row], list[Row], list[Row]]:
     """Plays `cfg.episodes` with the run's agent and each of `cfg.baseline`, all from the same
     places with the same draws, in homes of a `source` or of several, which have `numbers`. Returns
     the rows of the table, those of the agent less each other, and those of the episodes.
@@ -139,6 +133,6 @@ def _play(
     return rows, differences, episodes
 
 
-def _rows(where, played, source) -> "list[Row]":
+def _rows(where, played, source) -> list[Row]:
     sources = factory.sources_of(where.homes) if source is None else None
     return statistics.summaries(played, optional(where.env, "roles"), sources)

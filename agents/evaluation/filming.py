@@ -2,13 +2,12 @@
 
 import itertools
 from pathlib import Path
-from typing import cast
 
 from megastep import recording
 from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import eval_env, playing
-from megastep.agents.factory import components, env_failures, settings
+from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.runs import folders, restore
 from megastep.agents.selfplay.bots.random import RandomActions
@@ -22,20 +21,14 @@ def run(cfg: settings.Record) -> Path:
     is left.
     """
     folder, device = Path(), factory.make_device(cfg.device)
-    env_settings, geometry = cfg.env, cfg.geometry
     names = (cfg.run,) if cfg.run is not None else cfg.runs or ()
     runs = [folders.load_checkpoint(folders.find(name), cfg.trust, device) for name in names]
     if runs:
-        trained = factory.config_of(runs[0])
-        env_settings = trained.env
-        geometry = factory.typed_or(trained.geometry, geometry, env_settings)
         folder = folders.folder_of(runs[0].path)
-    env_settings = cast("settings.Env", env_settings)
+    env_settings, _, homes = factory.played_in(cfg, runs[0] if runs else None)
     if cfg.against is not None:
         env_settings = settings.changed_known(env_settings, **eval_env.FOR_TWO)
-    env_settings = settings.changed(env_settings, n_envs=1)
-    geometry = geometry or components.settings_for("geometry", components.HOMES)
-    homes, shown = factory.homes(env_settings, geometry, cfg.split), []
+    env_settings, shown = settings.changed(env_settings, n_envs=1), []
     for number in (cfg.home or 0,) if cfg.homes is None else cfg.homes:
         if number >= max(len(homes), 1):
             have = f"split={cfg.split} has {len(homes)}, from home=0"

@@ -2,15 +2,12 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from megastep.agents.types import Row
 from megastep.arrdict import arrdict, numpyify
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
 
 #: How an episode ended: terminal or truncated, as the environment said, or cut off at the limit of
 #: steps.
@@ -70,7 +67,7 @@ def _counted(played) -> np.ndarray:
 
 def summaries(
     played: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
-) -> "list[Row]":
+) -> list[Row]:
     """Returns the table rows of the result of `first_episodes` or `first_duels`: one overall, then
     one per role and one per source of homes.
 
@@ -106,7 +103,7 @@ def summaries(
     return rows
 
 
-def _summary(played, lanes) -> "Row":
+def _summary(played, lanes) -> Row:
     homes, length = played.get("homes"), float(played["lengths"][lanes].mean())
     n_homes = None if homes is None else len(np.unique(homes[lanes]))
     if "score" in played:
@@ -157,7 +154,7 @@ def rows_of(
     numbers: Sequence[int],
     sources: Sequence[str] | None = None,
     roles: Sequence[str] | None = None,
-) -> "list[Row]":
+) -> list[Row]:
     """Returns a dict per episode of the result of `first_episodes`, of the lanes that count:
 
     - episode: the number of the lane; seed: of the evaluation

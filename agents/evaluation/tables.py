@@ -9,9 +9,9 @@ from pathlib import Path
 from megastep.agents import console
 from megastep.agents.errors import user_errors
 from megastep.agents.evaluation.eval_env import EvalEnv
-from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree
-from megastep.agents.factory.settings import Evaluate, Geometry, env_name, label
+from megastep.agents.factory.components import SUITE, env_name, label
+from megastep.agents.factory.settings import Evaluate, Geometry
 from megastep.agents.runs import checkpoint
 from megastep.agents.runs.folders import folder_of, for_file
 from megastep.agents.runs.typed_json import encoded
@@ -137,7 +137,7 @@ def part_of(row: dict) -> str:
 
 def parts_of(geometry: Geometry, homes: list) -> list[tuple[str | None, list]]:
     """Returns [(source, its homes)] of a suite, and [(None, homes)] of all other geometries."""
-    if geometry.name != components.SUITE:
+    if geometry.name != SUITE:
         return [(None, homes)]
     parts = {}
     for home in homes:

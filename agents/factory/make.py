@@ -13,7 +13,16 @@ from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, components
 from megastep.agents.factory.components import env_name, label
-from megastep.agents.factory.settings import Agent, Env, Geometry, Learner, Train, Trained, changed
+from megastep.agents.factory.settings import (
+    Agent,
+    Env,
+    Geometry,
+    Learner,
+    Played,
+    Train,
+    Trained,
+    changed,
+)
 from megastep.agents.generator import stream_seed
 from megastep.agents.hardware import make_device as make_device
 from megastep.agents.hardware import share_threads
@@ -106,14 +115,20 @@ def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
     return [*{id(home): home for home in construct(geometry, split=split)}.values()]
 
 
-def typed_or(geometry: Geometry, typed: Geometry | None, env: Env) -> Geometry:
-    """Returns the geometry that was typed, else the other. UserError if `env` takes none."""
-    if typed is not None and not components.takes_geometries(env.name):
+def played_in(
+    cfg: Played, loaded: checkpoint.Checkpoint | None = None
+) -> tuple[Env, Geometry, list[dict]]:
+    """Returns environment, geometry and homes: those of `cfg`, else those of a training."""
+    trained = loaded and config_of(loaded)
+    env = cfg.env or (trained and trained.env)
+    if cfg.geometry is not None and not components.takes_geometries(env.name):
         raise UserError(
             f"{env_name(env)} takes no floor plans, so it cannot be played in "
-            f"geometry={label(typed.name)}; leave geometry out"
+            f"geometry={label(cfg.geometry.name)}; leave geometry out"
         )
-    return geometry if typed is None else typed
+    geometry = cfg.geometry or (trained and trained.geometry)
+    geometry = geometry or components.settings_for("geometry", components.HOMES)
+    return env, geometry, homes(env, geometry, cfg.split)
 
 
 def spread(homes: list[dict], n_envs: int) -> list[dict]:
@@ -186,16 +201,6 @@ def sources_of(geometries: Sequence[Mapping]) -> list[str] | None:
     """Returns the `source` of each geometry, which `geometry=mixed` sets; None if one has none."""
     sources = [g.get("source") if isinstance(g, Mapping) else None for g in geometries]
     return None if None in sources else [*map(str, sources)] or None
-
-
-def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
-    """Returns the name of the source of each layout in training, None if unknown."""
-    sources = sources_of(geometries)
-    if sources is None or getattr(env, "resample", False):
-        return sources
-    if env.n_envs < len(sources) and not env.name.startswith("megastep."):
-        return None
-    return scene.spread(sources, env.n_envs)
 
 
 def make_opponents(

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from megastep.agents.factory import components, conflicts
-from megastep.agents.factory.components import env_name, label
 from megastep.agents.population.variation import Variation
 from megastep.imports import import_object
 from megastep.settings import frozen
@@ -128,12 +127,6 @@ def changed(settings: T, **changes: object) -> T:
 def changed_known(settings: T, **changes: object) -> T:
     """Returns a copy of settings with those of the changes that it has."""
     return changed(settings, **{k: v for k, v in changes.items() if hasattr(settings, k)})
-
-
-def run_name(cfg: "Train") -> str:
-    """What the folder of a run is called after the time, from its settings."""
-    geometry = [label(cfg.geometry.name)] if components.takes_geometries(cfg.env.name) else []
-    return "-".join([env_name(cfg.env), *geometry, str(cfg.seed)])
 
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import torch
 
+from megastep import scene
 from megastep.agents import console
 from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import UserError, memory_problem, shortened
@@ -120,11 +121,14 @@ def make_trainer(
             callbacks=[*observers, *(import_object(name)() for name in cfg.callbacks)],
             ranks=ranks,
         )
+        sources = factory.sources_of(homes)
         if cfg.curriculum.name != "none":
             parts: dict = dict(env=trainer.env, learner=learner, rollout=trainer.rollout)
-            sources = factory.sources_of(homes)
             trainer.curriculum = factory.construct(cfg.curriculum, sources=sources, **parts)
-        trainer.episodes.begin(trainer, factory.layout_sources(cfg.env, homes), cfg.desync)
+        if sources and not getattr(cfg.env, "resample", False):  # an environment stays in one
+            is_known = cfg.env.n_envs >= len(sources) or cfg.env.name.startswith("megastep.")
+            sources = scene.spread(sources, cfg.env.n_envs) if is_known else None
+        trainer.episodes.begin(trainer, sources, cfg.desync)
         if resumed:
             with state_errors(resumed.path):
                 trainer.run_state.load_state_dict(had, is_new_rank=number >= resumed.n_ranks)

@@ -12,7 +12,6 @@ from megastep.agents import console, package
 from megastep.agents.distributed import environment
 from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.launch import signals
-from megastep.agents.runs import checkpoint, folders, populations
 from megastep.atomic_files import write_atomically
 
 #: Environment variable with the job folder, set for ranks that `launcher` started.
@@ -68,11 +67,3 @@ def report_ending(ending: Ending) -> None:
             write_atomically(path, json.dumps(ending).encode())
     elif ending.text:
         console.say(f"{package.command('train')}: {ending.text}", sys.stderr)
-
-
-def hint(folder: Path | None) -> str:
-    """Returns how to continue a run whose ranks were lost in the middle of an update."""
-    runs = () if folder is None else populations.members(folder) or [folder]
-    if folder is None or not all(checkpoint.list_checkpoints(run / "checkpoints") for run in runs):
-        return "Nothing was saved yet"
-    return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"

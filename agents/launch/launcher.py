@@ -25,7 +25,7 @@ from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, settings
 from megastep.agents.launch import endings, gpu, signals
-from megastep.agents.runs import typed_json
+from megastep.agents.runs import folders, typed_json
 
 ADDRESS = "127.0.0.1"
 #: Code that runs a rank. Modules in the current folder must not shadow Python's own.
@@ -147,7 +147,7 @@ class Job:
             name = signal.Signals(-code).name
             text = f"was killed by {name}" + ", perhaps out of memory" * (name == "SIGKILL")
         path = self.folder / endings.RUN
-        hint = endings.hint(Path(path.read_text()) if path.exists() else None)
+        hint = folders.to_continue(Path(path.read_text()) if path.exists() else None)
         label = f"rank {number} on {environment.hostname()}"
         return endings.Ending(endings.LOST, f"{label} {text}. {hint}")
 

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from megastep import engine
 from megastep.agents import console
 from megastep.agents.algorithms.nonfinite import NonFiniteError
@@ -19,13 +21,14 @@ from megastep.agents.distributed import process_group
 from megastep.agents.distributed.process_group import from_rank_0, together
 from megastep.agents.distributed.ranks import DriftError
 from megastep.agents.errors import EnvFailed, UserError, memory_problem, user_errors
-from megastep.agents.factory import env_failures, settings
+from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training.budget import reaches
 from megastep.agents.training.callbacks import Progress
+from megastep.atomic_files import write_atomically
 from megastep.types import DEFAULTS, optional
 
 if TYPE_CHECKING:
@@ -109,7 +112,10 @@ class Run:
         """Returns the folder, locked, and what `make` continues from, if anything. On rank 0."""
         cfg = self.cfg
         if cfg.resume in (None, again.AUTO):
-            folder = folders.new(settings.run_name(cfg), cfg.folder, cfg.resume == again.AUTO)
+            names = [components.env_name(cfg.env), str(cfg.seed)]
+            if components.takes_geometries(cfg.env.name):
+                names.insert(1, components.label(cfg.geometry.name))
+            folder = folders.new("-".join(names), cfg.folder, cfg.resume == again.AUTO)
             locks.enter_context(folders.locked(folder))
             return folder, None
         folder = folders.folder_of(folders.find(str(cfg.resume)))
@@ -234,8 +240,10 @@ def evaluations(*arguments: Any) -> Any:
 
 def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:
     """Writes the settings of an agent that starts to train, and a line about where it does."""
-    folder = trainer.saver.folder.parent
-    folders.write_config(folder, trainer.saver.config["train"])
+    folder, config = trainer.saver.folder.parent, trainer.saver.config["train"]
+    with user_errors(folders.CANNOT.format(folder)):
+        text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")
+        write_atomically(folder / "config.yaml", text)
     provenance.record(folder, trainer.samples, device, hosts)
 
 

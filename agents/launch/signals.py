@@ -18,7 +18,9 @@ from megastep.agents.distributed import environment
 QUITTING = (signal.SIGINT, signal.SIGTERM)
 #: Signals by which clusters announce that SIGTERM will follow.
 ANNOUNCING = (signal.SIGUSR1, signal.SIGUSR2)
-SIGNALS = (*QUITTING, *ANNOUNCING, signal.SIGHUP)
+SIGNALS = [*QUITTING, *ANNOUNCING, signal.SIGHUP]
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # by nohup
+    SIGNALS.remove(signal.SIGHUP)
 #: Seconds within which a second signal counts as a repetition of the first: `timeout` and a closing
 #: terminal send two.
 SAME = 0.3
@@ -113,18 +115,14 @@ def stop(process: int) -> None:
     SIGHUP, unless it is ignored, ends no process at once, even as the second signal.
     """
     with contextlib.suppress(ProcessLookupError):
-        os.kill(process, signal.SIGTERM if _is_hangup_ignored() else signal.SIGHUP)
-
-
-def _is_hangup_ignored() -> bool:
-    return signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # by nohup
+        os.kill(process, signal.SIGHUP if signal.SIGHUP in SIGNALS else signal.SIGTERM)
 
 
 def _install(handler: Callable) -> dict[int, Callable | int | None]:
     """Returns the previous handlers. Does nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return {}
-    return {n: signal.signal(n, handler) for n in SIGNALS[: -1 if _is_hangup_ignored() else None]}
+    return {number: signal.signal(number, handler) for number in SIGNALS}
 
 
 def _write(stream: TextIO | None, line: str) -> None:

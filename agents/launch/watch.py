@@ -22,6 +22,7 @@ from megastep.agents import console
 from megastep.agents.distributed import environment, process_group
 from megastep.agents.errors import UserError
 from megastep.agents.launch import endings
+from megastep.agents.runs import folders
 
 #: Seconds between heartbeats.
 PERIOD = 2.0
@@ -177,7 +178,7 @@ class Team:
         # a folder on a machine that is gone blocks whoever reads it, and so may a pipe
         if problem:
             unknown = "Its run folder does not answer, so what is saved is not known"
-            advice = within(CALL_SECONDS, lambda: endings.hint(self.folder), unknown)
+            advice = within(CALL_SECONDS, lambda: folders.to_continue(self.folder), unknown)
             ending = endings.Ending(endings.LOST, f"{problem}. {advice}")
             within(CALL_SECONDS, lambda: endings.report_ending(ending), None)
         within(CALL_SECONDS, console.restore, None)

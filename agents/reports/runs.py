@@ -2,15 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from megastep.agents.errors import UserError
 from megastep.agents.factory.check import leaves
-from megastep.agents.factory.settings import label
+from megastep.agents.factory.components import label
 from megastep.agents.runs import folders, json_lines, scores, typed_json
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Config, Row
+from megastep.agents.types import Config, Row
 
 #: Settings that differ between seeds of one experiment, or do not change what is learnt.
 OF_A_SEED = "seed", "folder", "resume", "rerun", "ranks", "device", "finish", "logger", "dry_run"
@@ -20,11 +18,11 @@ class Run(NamedTuple):
     """A run that has been trained, or is being trained."""
 
     folder: Path
-    config: "Config"  # its settings as nested dicts
-    metrics: "list[Row]"  # the rows of its files
-    perf: "list[Row]"
-    provenance: "list[Row]"
-    evaluations: "list[Row]"  # the contents of `evaluations/*.json`, in the order of names
+    config: Config  # its settings as nested dicts
+    metrics: list[Row]  # the rows of its files
+    perf: list[Row]
+    provenance: list[Row]
+    evaluations: list[Row]  # the contents of `evaluations/*.json`, in the order of names
 
     @property
     def task(self) -> str:
@@ -32,7 +30,7 @@ class Run(NamedTuple):
         names = [self.config[group] for group in ("env", "geometry") if group in self.config]
         return ", ".join(label(str(group.get("name"))) for group in names)
 
-    def settings(self) -> "Row":
+    def settings(self) -> Row:
         """Returns {dotted key: value} of all settings but those of a seed."""
         return {k: v for k, v in leaves(self.config) if k.split(".")[0] not in OF_A_SEED}
 
@@ -72,7 +70,7 @@ class Run(NamedTuple):
         cells += [cell for _, means in self._evaluated() for cell in means.items()]
         return [key for key in dict(cells) if key not in texts]
 
-    def _evaluated(self) -> "list[tuple[int, Row]]":
+    def _evaluated(self) -> list[tuple[int, Row]]:
         """Returns the samples, and the means by metric, of evaluations as in training."""
         found = []
         for table in self.evaluations:

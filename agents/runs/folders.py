@@ -12,17 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import yaml
-
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.runs import agent_file, checkpoint, populations, trust, typed_json
-from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     import torch
-
-    from megastep.agents.types import Config
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: File with the run folder of each start, one per line.
@@ -75,13 +70,6 @@ def check_free(name: str | None, is_again: bool = False) -> None:
         if checkpoint.list_checkpoints(folder / "checkpoints"):
             text = f"{text}, or continue its run: {resume_command(folder)}"
         raise UserError(text)
-
-
-def write_config(folder: Path, config: "Config") -> None:
-    """Writes a run's configuration into its folder."""
-    with user_errors(CANNOT.format(folder)):
-        text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")
-        write_atomically(folder / "config.yaml", text)
 
 
 @contextlib.contextmanager
@@ -190,9 +178,9 @@ def load_checkpoint(
     return loaded
 
 
-def resume_command(folder: Path, key: str = "resume") -> str:
-    """Returns the command that resumes a run, or with the key `rerun` repeats it."""
-    return command_of("train", key, folder)
+def resume_command(folder: Path) -> str:
+    """Returns the command that resumes a run."""
+    return command_of("train", "resume", folder)
 
 
 def command_of(script: str, key: str, folder: Path) -> str:
@@ -202,11 +190,11 @@ def command_of(script: str, key: str, folder: Path) -> str:
     return f"{package.command(script, 'python ')} {shlex.quote(f'{key}={name}')}"
 
 
-def to_continue(folder: Path) -> str:
+def to_continue(folder: Path | None) -> str:
     """Returns a sentence with the command that continues a run, or why it cannot be continued."""
-    where = populations.folder_of(folder, 0) if populations.is_root(folder) else folder
-    if not checkpoint.list_checkpoints(where / "checkpoints"):
-        return "It has no checkpoint, so it cannot be continued"
+    runs = [] if folder is None else populations.members(folder) or [folder]
+    if folder is None or not all(checkpoint.list_checkpoints(run / "checkpoints") for run in runs):
+        return "Nothing was saved yet"
     return f"To continue: {resume_command(folder)}"
 
 

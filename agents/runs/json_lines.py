@@ -8,14 +8,11 @@ import math
 import os
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megastep.agents.errors import user_errors
 from megastep.agents.runs import typed_json
+from megastep.agents.types import Row
 from megastep.atomic_files import AppendedFile, write_atomically
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
 
 
 class JsonLines:
@@ -56,7 +53,7 @@ class JsonLines:
         return True
 
 
-def read(path: Path | str, kind: object = None) -> "list[Row]":
+def read(path: Path | str, kind: object = None) -> list[Row]:
     """Returns the objects in a file, or of a kind from `typed_json`, else UserError. Skips damaged
     lines with a warning, and silently a last line that a crash cut short.
     """
@@ -81,7 +78,7 @@ def truncate_after(path: Path | str, step: int) -> None:
         write_atomically(path, data)
 
 
-def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
+def _intact_lines(path: Path) -> list[tuple[Row, bytes]]:
     """Returns (object, bytes) of each intact line."""
     intact, damaged, lines = [], [], path.read_bytes().split(b"\n")
     for number, line in enumerate(lines, 1):

@@ -5,13 +5,10 @@
 import contextlib
 import itertools
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.runs import checkpoint, json_lines, scores, typed_json
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
+from megastep.agents.types import Row
 
 FILE, PREFIX, KEY = "population.jsonl", "member-", "settings/"
 #: What `population.score` may be beside the name of an episode statistic.
@@ -56,7 +53,7 @@ def best(root: Path) -> int | None:
     return found.index(max(known)) if known else None
 
 
-def member(root: Path, which: "int | str" = "best") -> Path:
+def member(root: Path, which: int | str = "best") -> Path:
     """Returns the run folder of a member, by its number or `best`. UserError for others."""
     n = len(members(root))
     if (number := best(root) if which == "best" else int(which)) is None:
@@ -102,7 +99,7 @@ def beginning(root: Path) -> checkpoint.Checkpoint:
     return checkpoint.Checkpoint(path, 0, numbers, config, {})
 
 
-def read(path: Path) -> "list[list[Row]]":
+def read(path: Path) -> list[list[Row]]:
     """Returns the rows of `population.jsonl`, a list for each generation, each in the order of
     members. Raises UserError if the file cannot be read, or holds something else.
     """
@@ -130,12 +127,12 @@ def first_copy(folder: Path) -> int | None:
         return next((row["generation"] for row in rows if row["from"] != row["member"]), None)
 
 
-def settings_of(row: "Row") -> dict[str, float]:
+def settings_of(row: Row) -> dict[str, float]:
     """Returns the settings in a row, by key."""
     return {key[len(KEY) :]: value for key, value in row.items() if key.startswith(KEY)}
 
 
-def lineage(generations: "list[list[Row]]", member: int) -> list[int]:
+def lineage(generations: list[list[Row]], member: int) -> list[int]:
     """Returns the ancestor of a member after each generation, up to itself after the last."""
     line = [member]
     for rows in reversed(generations[1:]):

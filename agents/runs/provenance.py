@@ -28,12 +28,8 @@ def record(folder: Path, samples: int, device: torch.device, hosts: Sequence[str
             "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
             "command": shlex.join(sys.orig_argv),
             "commit": commit(package.ROOT),
-            "megastep": package.version(),
-            "torch": torch.__version__,
-            "cuda": torch.version.cuda,
             "python": platform.python_version(),
-            "device": device_name(device),
-            "ranks": len(hosts) if len(hosts) > 1 else None,
+            **made_with(device, len(hosts)),
             "hosts": ", ".join(dict.fromkeys(hosts)) if len(hosts) > 1 else None,
         }
         known = {name: text for name, text in facts.items() if text}
@@ -50,8 +46,12 @@ def made_with(device: torch.device, n_ranks: int = 1) -> dict[str, str | int]:
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
         return facts | {"device": f"cuda {name}", "cuda": torch.version.cuda}
+    model = None
+    with contextlib.suppress(OSError):
+        model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+    name = model[1] if model else platform.processor() or platform.machine()
     instructions, n_threads = torch.backends.cpu.get_cpu_capability(), torch.get_num_threads()
-    return facts | dict(device=device_name(device), instructions=instructions, threads=n_threads)
+    return facts | dict(device=f"cpu {name}", instructions=instructions, threads=n_threads)
 
 
 def commit(folder: Path) -> str | None:
@@ -70,13 +70,3 @@ def commit(folder: Path) -> str | None:
             timeout=5,  # seconds; a repository may be on a slow disk
             text=True,
         ).strip()
-
-
-def device_name(device: torch.device) -> str:
-    """Returns the name of a GPU, or `cpu` and the processor's name."""
-    if device.type == "cuda":
-        return f"{device} {torch.cuda.get_device_name(device)}"
-    model = None
-    with contextlib.suppress(OSError):
-        model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
-    return f"cpu {model[1] if model else platform.processor() or platform.machine()}"

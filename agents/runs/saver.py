@@ -10,17 +10,14 @@ import threading
 import time
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch.utils._pytree import tree_leaves
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
 from megastep.agents.runs import checkpoint
+from megastep.agents.types import Config, Row, StateDict
 from megastep.atomic_files import delete, replacing
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Config, Row, StateDict
 
 #: A replay buffer of up to so many bytes is in every checkpoint; in the last one of a run.
 SMALL_REPLAY, LAST_REPLAY = 2**28, 2**32

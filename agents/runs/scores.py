@@ -1,19 +1,16 @@
 """Scores of runs and evaluations."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megastep.agents.errors import user_errors
 from megastep.agents.runs import json_lines, typed_json
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
+from megastep.agents.types import Row
 
 #: Settings of an evaluation in another environment or in other homes than those in training.
 OTHERWISE = "env", "geometry", "greedy", "against", "max_steps"
 
 
-def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float | None:
+def mean(rows: list[Row], name: str = "return", n_reports: int = 10) -> float | None:
     """Returns the mean return, or another statistic, of the episodes in the last reports of
     `metrics.jsonl`, each once although windows overlap. None if none has one.
     """
@@ -30,7 +27,7 @@ def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float 
     return total / n_episodes if n_episodes else None
 
 
-def evaluation(file: Path) -> "Row":
+def evaluation(file: Path) -> Row:
     """Returns the contents of one of `evaluations/*.json`. Raises UserError if it is another."""
     with user_errors(f"{file} is not an evaluation: "):
         return typed_json.loads(file.read_bytes(), typed_json.Evaluation)

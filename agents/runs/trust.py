@@ -11,12 +11,9 @@ import re
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megastep.agents.errors import UserError, shortened
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Config
+from megastep.agents.types import Config
 
 #: Settings groups that may contain import paths.
 GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum", "logger", "callbacks")
@@ -27,7 +24,7 @@ OWN = re.compile(
 )
 
 
-def foreign_names(config: "Config") -> list[str]:
+def foreign_names(config: Config) -> list[str]:
     """Returns the import paths in a configuration that are not megastep's own."""
     train, names = config.get("train"), set()
     stack = [train.get(group) for group in GROUPS] if isinstance(train, dict) else []
@@ -60,7 +57,7 @@ def untrusted(names: Iterable[str]) -> list[str]:
     return [name for name in names if name not in known]
 
 
-def check(config: "Config", source: object, cure: str = CURE) -> None:
+def check(config: Config, source: object, cure: str = CURE) -> None:
     """Raises UserError if a configuration in `source` names what may not be imported."""
     names = foreign_names(config)
     if names and (names := untrusted(names)):

@@ -20,7 +20,7 @@ __all__ = ["hosts"]
 pytestmark = pytest.mark.usefixtures("here")
 TINY = [*tiny.TINY, "logging.every=1", "folder=run", "checkpoints.seconds=0.5"]
 UPDATE = 2 * tiny.UPDATE
-CONTINUE = "Its last checkpoint is intact. To continue: python train.py resume=run\n"
+CONTINUE = "To continue: python train.py resume=run\n"
 
 #: Trains with deadlines that a test can wait for, once ranks have started, which takes long on a
 #: busy machine. Ranks write down the sums of their weights' bits.

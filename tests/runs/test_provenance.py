@@ -73,5 +73,5 @@ def test_no_failure_ends_a_run(tmp_path, monkeypatch):
     def failing(*_, **__):
         raise RuntimeError
 
-    monkeypatch.setattr(provenance, "device_name", failing)
+    monkeypatch.setattr(provenance, "made_with", failing)
     provenance.record(tmp_path, 0, CPU)
