@@ -67,9 +67,7 @@ def is_import_path(value: object) -> bool:
 
 
 class Composer:
-    """Composes and checks the configuration of one command, from a file `name`, and from a folder
-    whose files and groups are found beside ours.
-    """
+    """Composes and checks a command's settings, from a file `name`, and a `folder` beside ours."""
 
     def __init__(self, command: "Command", name: str | None = None, folder: str | None = None):
         self.command, self.name, self.folder = command, name or command.name, folder

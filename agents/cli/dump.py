@@ -30,5 +30,4 @@ def run(cfg: settings.Dump) -> Path:
 
 
 COMMAND = Command("dump", run, HELP, settings.Dump, evaluate.prepare, evaluate.ready)
-#: Runs the command with words of a command line, by default this process's.
 main = COMMAND.main

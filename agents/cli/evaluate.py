@@ -52,5 +52,4 @@ def run(cfg: settings.Evaluate) -> Path:
 
 
 COMMAND = Command("evaluate", run, HELP, settings.Evaluate, prepare, ready, has_ranks=True)
-#: Runs the command with words of a command line, by default this process's.
 main = COMMAND.main

@@ -33,5 +33,4 @@ def run(cfg: settings.Record) -> Path:
 
 
 COMMAND = Command("record", run, HELP, settings.Record, evaluate.prepare, evaluate.ready)
-#: Runs the command with words of a command line, by default this process's.
 main = COMMAND.main

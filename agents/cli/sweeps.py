@@ -1,6 +1,4 @@
-"""Sweeps by Hydra's launchers and sweepers. Added here: the check of all jobs before the first
-starts, the GPUs of each job, what a job returns, and the table of them all.
-"""
+"""Sweeps by Hydra: all jobs are checked first, have GPUs of their own, and end in one table."""
 
 import contextlib
 import csv
@@ -194,9 +192,7 @@ def new_job(
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """What Hydra calls for a job, in whichever process a launcher starts; it records what became of
-    the job. It composes again, as the machine may have another device.
-    """
+    """What Hydra calls for a job, in whichever process. It composes again, for the device there."""
 
     source: tuple  # the script's name, and the other arguments of the Composer
     folder: str  # that of the sweep
@@ -230,9 +226,7 @@ class Job:
         return None if None in scores else sum(scores) / len(scores)
 
     def run_once(self, row: Row, words: list[str], is_joblib: bool) -> Row:
-        """Runs a job unless a cluster starts it again and it is done. Returns its row. A job of
-        joblib has a process of its own, so that one that is killed leaves the others.
-        """
+        """Runs a job, with joblib in its own process, unless a cluster repeats one that is done."""
         number = row["number"]
         if earlier := self.rows().get(number):
             return earlier if earlier["state"] == DONE else self.run(row, words, is_again=True)

@@ -59,9 +59,7 @@ CURES = {
 
 
 def prepare(tree: Tree, typed: list[str]) -> Tree:
-    """Returns the tree of a run that resumes or repeats another, which keeps its own settings, or
-    starts from its weights, in its environment, geometry and agent; typed keys and groups win.
-    """
+    """Returns the settings of a run that resumes, repeats or starts from another one."""
     set_ranks(tree, typed)
     if "population.member" in typed:
         text = "is set by a population; give population.size, or member= of one with init=RUN"
@@ -182,5 +180,4 @@ def run(cfg: settings.Train) -> Path | None:
 
 
 COMMAND = Command("train", run, HELP, settings.Train, prepare, ready, has_ranks=True)
-#: Runs the command with words of a command line, by default this process's.
 main = COMMAND.main

@@ -34,9 +34,7 @@ def parse(
     cure: Callable[[str], str] = str,
     loader: "ConfigLoader | None" = None,
 ) -> list[types.Override]:
-    """Returns words as Hydra's grammar reads them; a list needs no brackets: run=a,b. `cure` says
-    what is said of a word without `=`. Raises ConfigErrors with all unreadable ones.
-    """
+    """Returns words as Hydra's grammar reads them. ConfigErrors with all unreadable ones."""
     parser = overrides_parser.OverridesParser.create(loader)
     fields = kind.__pydantic_fields__.items()
     lists = [name for name, field in fields if "tuple" in repr(field.annotation)]

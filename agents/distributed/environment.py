@@ -17,9 +17,7 @@ class RankInfo(NamedTuple):
 
 
 def rank_info() -> RankInfo | None:
-    """Returns this process's rank if torchrun started it, None for a single process. ValueError if
-    torchrun's variables contradict each other.
-    """
+    """Returns this process's rank if torchrun started it. ValueError if its variables disagree."""
     if any(name not in os.environ for name in NAMES):
         return None
     texts = [os.environ[name] for name in NAMES]

@@ -1,6 +1,4 @@
-"""The ranks that train one policy together: what they exchange on the host, and what they agree on
-once per update.
-"""
+"""The ranks that train one policy: what they exchange on the host and agree on per update."""
 
 from __future__ import annotations
 

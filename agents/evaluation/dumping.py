@@ -44,9 +44,7 @@ STAGED = "episodes"
 
 
 def run(cfg: settings.Dump) -> Path:
-    """Writes a dataset, or what is missing of it. Returns its folder. Raises UserError: the folder
-    has other files, or the disk is too small; nothing is half-written.
-    """
+    """Writes a dataset, or what is missing of it. UserError if the folder has other files."""
     folder, device = Path(cfg.folder), factory.make_device(cfg.device)
     with user_errors(kinds=(data.DatasetError,)):
         formats.require(cfg.format)

@@ -10,7 +10,6 @@ import torch
 
 from megastep.agents import console
 from megastep.agents.distributed import process_group
-from megastep.agents.distributed.shard import Shard
 from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing
 from megastep.agents.factory import components, settings
@@ -19,7 +18,7 @@ from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.mixed_policy import rotating_teams, teams_of
-from megastep.arrdict import arrdict
+from megastep.arrdict import arrdict, cat
 from megastep.env_state import way_back
 from megastep.types import Env, PolicyLike, optional
 
@@ -39,6 +38,40 @@ class Player(NamedTuple):
     def step(self) -> int | None:
         """The number of samples it has learnt from."""
         return self.loaded and self.loaded.step
+
+
+class Shard:
+    """The environments that rank `number` of `n_ranks`, at most N, plays of an evaluation's N.
+
+    Of N environments in D homes, e is in home e mod D, and rank r of R plays r, r + R, r + 2 R, ...
+    Together ranks play each home as often as a single process does, with other spawns and actions.
+
+    Attributes:
+        envs: indices of its environments among the N.
+        homes: indices of its homes among the D; its i-th environment is in `homes[i % len(homes)]`.
+    """
+
+    def __init__(self, n_envs: int, n_homes: int, number: int = 0, n_ranks: int = 1):
+        self.n_envs, self.n_ranks = n_envs, n_ranks
+        self.envs = range(number, n_envs, n_ranks)
+        self.homes = [*dict.fromkeys(env % n_homes for env in self.envs)] if n_homes else []
+
+    def with_others(self, values: arrdict) -> arrdict:
+        """Gathers the values of all N environments, in order, from tensors (n, ...) of this rank's
+        n, or (n A, ...) of their lanes. Indices within the shard, in leaves called `envs` and
+        `homes`, become indices among all. Waits for the other ranks.
+        """
+        if self.n_ranks == 1:
+            return values
+        values = values.map(torch.Tensor.cpu)
+        for name in ("envs", "homes"):
+            if name in values and (numbers := [*getattr(self, name)]):
+                values[name] = torch.tensor(numbers)[values[name].long()].to(values[name])
+        whole = cat(process_group.gather_objects(values))
+        n_each = len(next(iter(whole.values()))) // self.n_envs  # lanes per environment
+        envs = [env for r in range(self.n_ranks) for env in range(r, self.n_envs, self.n_ranks)]
+        rows = torch.tensor(envs).argsort()[:, None] * n_each + torch.arange(n_each)
+        return whole[rows.flatten()]
 
 
 class EvalEnv:
@@ -87,7 +120,9 @@ class EvalEnv:
             n_envs += -n_envs % len(homes) if n_envs > len(homes) > 0 else 0
             n_homes = n_envs
         self.homes = factory.spread([*homes], n_homes)
-        self.shard = (Shard.of_this_rank if is_shared else Shard)(n_envs, len(self.homes))
+        ranks = process_group.rank(), process_group.n_ranks()
+        are_few = not is_shared or ranks[1] > n_envs  # each rank plays all
+        self.shard = Shard(n_envs, len(self.homes), *(() if are_few else ranks))
         self.settings = settings.changed(env, n_envs=len(self.shard.envs))
         self.device, self._go_back, self._is_used = device, None, False
         self.env: Env = self._made()

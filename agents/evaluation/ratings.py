@@ -39,9 +39,7 @@ COLUMNS = {
 def write(
     cfg: settings.Evaluate, run: checkpoint.Checkpoint, where: EvalEnv, geometry: settings.Geometry
 ) -> Path:
-    """Rates a run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels of
-    each with each. Prints a table, writes ratings.csv into the run's folder, and returns its path.
-    """
+    """Rates a run's snapshots, and others, by duels of each with each; writes ratings.csv."""
     folder, players = folders.folder_of(run.path), []
     for path in (
         checkpoint.list_checkpoints(folder / "snapshots")
@@ -86,9 +84,7 @@ def write(
 
 
 def rate(n_players: int, scores: Scores, seed: int = 1) -> list[tuple[float, float]]:
-    """Returns the rating (mean, standard deviation) of each player, a mean over `N_ORDERS` random
-    orders of the duels, as the model updates ratings duel by duel.
-    """
+    """Returns (mean, standard deviation) of each player's rating, over random orders of duels."""
     from openskill.models import PlackettLuce
 
     duels = [(i, j, score) for (i, j), values in scores.items() for score in values]

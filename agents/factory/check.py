@@ -19,9 +19,7 @@ T = TypeVar("T")
 
 
 def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
-    """Returns the settings of a dataclass, such as `settings.Train`, from nested dicts as YAML has
-    them. Raises ConfigErrors with everything that is wrong. `names` are more to suggest for a typo.
-    """
+    """Returns checked settings from nested dicts. ConfigErrors names all errors at once."""
     try:
         chosen = components.adapter(kind).validate_python(tree)
     except ValidationError as error:

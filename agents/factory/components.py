@@ -1,6 +1,4 @@
-"""The components that settings choose: the members of groups, and their settings, which are the
-arguments of their constructors. A module is imported once a member of it is chosen.
-"""
+"""The members of groups that settings choose. Constructor arguments are their settings."""
 
 import functools
 import importlib
@@ -125,9 +123,7 @@ class NoCurriculum:
 
 @functools.cache
 def kind_of(group: str, name: str) -> type:
-    """Returns the dataclass of the settings of a group's member, by the member's `name`. Raises
-    ValueError if nothing can be imported under this name, or it takes other arguments.
-    """
+    """Returns the dataclass of a member's settings. ValueError if it cannot be one of the group."""
     if (group, name) == ("curriculum", "none"):
         return NoCurriculum
     constructor, spec = import_object(name), GROUPS[group]

@@ -21,9 +21,7 @@ METHODS = "__init__", "reset", "step", "check", "desync"
 def caught(
     env: Env, folder: Path, saved: Callable[[], str] = lambda: "", rank: int = 0
 ) -> Iterator[None]:
-    """Turns an error of an environment of somebody else into an EnvFailed, and writes its traceback
-    into a folder. `saved` returns what else to say, such as the command that resumes.
-    """
+    """Turns errors of others' environments into EnvFailed, their traceback in a file."""
     try:
         yield
     except Exception as error:

@@ -151,9 +151,7 @@ def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
 def check_memory(
     env: Env, sample: types.Env, learner: object, geometries: list, n_members: int = 1, **arguments
 ) -> None:
-    """Raises UserError with the number that fits, if environments, a replay buffer or members need
-    more than the memory. The `sample` counts what environments share; if that is too much, more do.
-    """
+    """Raises UserError, with the number that fits, if memory is too small."""
     n_things, n_each, what = env.n_envs, 1, "environments"
     if n_members > 1:
         n_things, n_each, what = n_members, env.n_envs, "members (population.size)"

@@ -199,9 +199,7 @@ def budget_of(
 
 
 def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:
-    """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
-    limited, else by never; by never if the learner has no `set_lr`, or lr does not stay constant.
-    """
+    """Returns `cfg` with learner.anneal=auto replaced by samples, seconds or never."""
     if cfg.learner.anneal != "auto":
         return cfg
     is_free = has_set_lr and not conflicts.changes_lr(cfg.learner)

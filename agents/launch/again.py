@@ -1,7 +1,4 @@
-"""`resume=auto`: one command that starts a run, and continues it when it is repeated.
-
-Clusters repeat a job's command after a preemption, a time limit or the loss of a machine.
-"""
+"""`resume=auto`: starts a run, or continues it when a cluster repeats the command."""
 
 import os
 from pathlib import Path
@@ -43,10 +40,7 @@ def with_more(cfg: settings.Train) -> settings.Train:
 
 
 def automatic(cfg: settings.Train) -> Start:
-    """Decides whether `resume=auto` starts a run, continues it or has nothing left to do. Raises
-    ConfigErrors if a setting outside `RESUMABLE` differs from the run's, or `folder` is missing;
-    UserError if the folder holds something else, or no intact checkpoint.
-    """
+    """Returns how `resume=auto` begins. ConfigErrors if a setting outside `RESUMABLE` differs."""
     for key in ("more_samples", "more_seconds"):
         if getattr(cfg, key) is not None:
             text = f"would be added each time; with resume=auto give the total, {key[5:]}="

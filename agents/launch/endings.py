@@ -31,9 +31,7 @@ class Ending(NamedTuple):
 
 
 def ending_of(work: Callable[[], int | None]) -> Ending:
-    """Calls a function, which returns an exit code or None for 0. Returns how it ended, or raises
-    what the user cannot fix, such as bugs.
-    """
+    """Calls a function, which returns an exit code or None for 0. Raises bugs as they are."""
     try:
         with signals.interrupting():
             return Ending(work() or 0)

@@ -1,6 +1,4 @@
-"""What follows training: an evaluation, a video, a report, the loggers' last word, and for a run
-that repeats another, whether it has the same bytes.
-"""
+"""What follows training: evaluation, video, report, loggers' last word, comparison."""
 
 import itertools
 import json

@@ -4,10 +4,7 @@ import os
 
 
 def ask_for_queues() -> None:
-    """Has CUDA's driver make 32 queues for streams instead of 8, unless the user says how many: a
-    population has a stream for each member, and streams that share a queue wait for each other.
-    Call it before the driver starts.
-    """
+    """Has the driver, before it starts, make a queue for each member's stream, not 8 for all."""
     os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")
 
 

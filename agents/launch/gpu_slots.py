@@ -1,6 +1,4 @@
-"""Assigns the GPUs of this machine to the jobs of a sweep, in turn. A *slot* is a job's GPUs, one
-per rank.
-"""
+"""Assigns the GPUs of this machine, in turn, to a sweep's jobs: a *slot* has one per rank."""
 
 import contextlib
 import os

@@ -136,9 +136,7 @@ class Job:
             process.send_signal(number)
 
     def ending(self, failure: tuple[int, int]) -> endings.Ending:
-        """Returns what a rank wrote about its ending, otherwise what the exit code of the first
-        that failed says.
-        """
+        """Returns what a rank wrote about its ending, else what the first failed exit code says."""
         with contextlib.suppress(FileNotFoundError):
             return endings.Ending(*json.loads((self.folder / endings.ENDING).read_text()))
         number, code = failure

@@ -170,9 +170,7 @@ def member_settings(cfg: settings.Train, member: int) -> settings.Train:
 
 
 def table(population: Population, root: Path) -> str:
-    """Returns a table of the members: the score by which commands find the best, ancestor at the
-    first generation, settings. All ranks call it, once all members have written their metrics.
-    """
+    """Returns a table of the members, once all have written their metrics. All ranks call it."""
     ranked_by = population.chosen.score
     runs = [trainer.saver.folder.parent for trainer in population.trainers]
     scores = population.gathered([populations.score_of(run, ranked_by) for run in runs])

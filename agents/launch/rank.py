@@ -1,6 +1,4 @@
-"""One rank of a training run, started by `launcher` or torchrun: it joins the other ranks and ends
-with them. Only one rank reports an error.
-"""
+"""One rank of a training run: it joins the others and ends with them; one reports errors."""
 
 import contextlib
 import os
@@ -30,9 +28,7 @@ def refuse(problem: str) -> None:
 
 @contextlib.contextmanager
 def joined() -> "Iterator[Team | None]":
-    """Joins the ranks that torchrun started, and yields the team; None in a single process. If one
-    fails, all end, and one reports it as a single process does; the others raise SystemExit.
-    """
+    """Yields the team of ranks that torchrun started, one of which reports errors; None alone."""
     global _team
     with user_errors():
         info = environment.rank_info()

@@ -62,9 +62,7 @@ class Run:
         self.progress = console.Progress()
 
     def run(self) -> Path:
-        """Opens or continues the run, trains, and finishes it. Returns its folder. Raises
-        Interrupted after a signal, once saved; UserError if training cannot start or continue.
-        """
+        """Opens or continues the run, trains, finishes. Interrupted after a signal, once saved."""
         if self.cfg.resume == again.AUTO:
             start = together(lambda: again.automatic(self.cfg))
             if start.ended:
@@ -248,9 +246,7 @@ def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:
 
 
 def check_shared(folder: Path) -> str:
-    """Checks that all ranks see the run folder of rank 0: UserError on all, if one does not.
-    Returns a random name of this start, the same on all ranks.
-    """
+    """UserError on all ranks if one does not see the folder. Returns a name of this start."""
     name = from_rank_0(secrets.token_hex)
     path = folder / f".ranks-{name}"
 

@@ -1,6 +1,4 @@
-"""Signals: the first stops a script gracefully, a second Ctrl-C or SIGTERM at once. The exit code
-is 128 plus the signal's number.
-"""
+"""Signals: the first stops a script gracefully, a second Ctrl-C or SIGTERM at once."""
 
 import contextlib
 import os
@@ -27,9 +25,7 @@ SAME = 0.3
 
 
 class Interrupted(BaseException):
-    """A signal stopped the script: its number, and what was saved and how to continue. A
-    BaseException, so that `except Exception` does not catch it.
-    """
+    """A signal: its number, what was saved and how to continue. `except Exception` misses it."""
 
 
 def announce(number: int) -> None:
@@ -85,9 +81,7 @@ def handled(
 
 @contextlib.contextmanager
 def interrupting(on_first: Callable[[int], None] = interrupt) -> Iterator[None]:
-    """Like `handled`, for an `on_first` that raises Interrupted, with which the block then always
-    ends, even if a library swallows it, or raises another error while it cleans up.
-    """
+    """Like `handled`; the block then ends with Interrupted even if a library swallows it."""
     with handled(on_first) as numbers:
         try:
             yield
@@ -111,9 +105,7 @@ def deferred() -> Iterator[None]:
 
 
 def stop(process: int) -> None:
-    """Stops another process gracefully, even if it has already received the terminal's Ctrl-C:
-    SIGHUP, unless it is ignored, ends no process at once, even as the second signal.
-    """
+    """Stops a process gracefully; unlike SIGTERM, SIGHUP never counts as a second signal."""
     with contextlib.suppress(ProcessLookupError):
         os.kill(process, signal.SIGHUP if signal.SIGHUP in SIGNALS else signal.SIGTERM)
 

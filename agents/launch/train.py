@@ -63,9 +63,7 @@ def run_rank() -> int:
 
 
 def dry_run(cfg: settings.Train) -> None:
-    """Prints environments, lanes and batch sizes, per rank or member and in total, and writes
-    nothing; also for `device=cuda` on a machine without a GPU.
-    """
+    """Prints environments, lanes and batch sizes, and writes nothing; does not need the GPU."""
     n_ranks, n_members = launcher.n_ranks(cfg), cfg.population.size
     is_elsewhere = cfg.device.startswith("cuda") and not gpu.is_available()
     device = factory.make_device("cpu" if is_elsewhere else cfg.device)

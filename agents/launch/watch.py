@@ -45,9 +45,7 @@ NUMBERS = itertools.count()
 
 
 def within(seconds: float | None, function: Callable[[], T], default: T) -> T:
-    """Returns what a function returns, or a default if that takes longer, in a thread that is left
-    behind, or fails.
-    """
+    """Returns what a function returns; a default if it fails, or takes longer, in a thread."""
     values = [default]
 
     def call() -> None:

@@ -1,6 +1,4 @@
-"""Who copies whom in a generation, and with which settings: functions of the seed, the generation,
-the member and the scores alone (Jaderberg et al. 2017).
-"""
+"""Who copies whom (Jaderberg et al. 2017), from seed, generation and scores alone."""
 
 import math
 import random

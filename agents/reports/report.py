@@ -37,9 +37,7 @@ NOT_DRAWN = ("episode/count", "episode/window", "updates")
 
 
 def write(paths: Sequence[Path], file: Path) -> Path:
-    """Writes the report of runs into a file, and returns its path. Raises UserError: a folder is
-    not a run, runs share no metric, or the file cannot be written.
-    """
+    """Writes the report of runs into a file, and returns its path. UserError."""
     every, charts = [*map(runs.read, paths)], Charts()
     body = _one(every[0], charts, file) if len(every) == 1 else _several(every, charts)
     parts = {

@@ -58,9 +58,7 @@ def write(
     tables: Sequence[Row] = (),
     wrappers: Mapping[str, object] | None = None,
 ) -> None:
-    """Writes an agent file atomically: the policy's state, on the CPU, in the dtypes to store; and
-    what this file's head describes. Raises OSError.
-    """
+    """Writes an agent file: the policy's state in the dtypes to store, and what the head says."""
     from safetensors.torch import save
 
     texts: dict = dict(config=config, facts=dict(facts), tables=[*tables])
@@ -86,9 +84,7 @@ def sealed(content: bytes) -> bytes:
 
 
 def read(path: Path, device: torch.device | str | None) -> Checkpoint:
-    """Loads an agent file as a checkpoint that has only the policy's state, on a device; without
-    one no state. Raises CheckpointError if it is damaged or of another version.
-    """
+    """Loads an agent file as a checkpoint of a policy; without a device, no state."""
     metadata, state = read_metadata(path), None
     if device is not None:
         from safetensors.torch import load_file

@@ -182,9 +182,7 @@ def load_latest(
     is_whole: bool = True,
     rank: int = 0,
 ) -> Checkpoint:
-    """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`,
-    as `read`. Warns of each damaged checkpoint that it skips.
-    """
+    """Loads the newest intact checkpoint of a folder, or that at it. Warns of damaged ones."""
     folder, messages = Path(folder), []
     if (folder / "manifest.json").exists() or _NAME.fullmatch(folder.name):
         return read(folder, device, is_whole, rank)

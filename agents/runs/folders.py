@@ -57,9 +57,7 @@ def new(name: str, folder: str | None = None, is_again: bool = False) -> Path:
 
 
 def check_free(name: str | None, is_again: bool = False) -> None:
-    """Raises UserError if the folder of a new run is not empty or cannot be read. `is_again` also
-    allows that of a run that ended before it saved anything.
-    """
+    """UserError if a new run's folder is used; `is_again`: by no run that has saved nothing."""
     folder = Path(name or "")
     with user_errors(CANNOT.format(shortened(folder))):
         entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
@@ -74,9 +72,7 @@ def check_free(name: str | None, is_again: bool = False) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Locks a run folder for the context; the system releases it even after kill -9. UserError if
-    another process, which it names, trains in it, or it cannot be written.
-    """
+    """Locks a run folder until kill -9 at the latest. UserError if another process has done so."""
     import filelock  # slow to import
 
     # the timeout is for a previous owner that is just deleting the file
@@ -162,10 +158,7 @@ def load_checkpoint(
     is_whole: bool = False,
     rank: int = 0,
 ) -> checkpoint.Checkpoint:
-    """Loads the latest intact checkpoint of a path from `find`, as `checkpoint.read` does, or an
-    agent file. UserError if there is none, or it names what this user has not trained with and is
-    not trusted.
-    """
+    """Loads the latest intact checkpoint, or agent file, of a path from `find`, if trusted."""
     with user_errors(kinds=(OSError, checkpoint.CheckpointError)):
         if agent_file.is_agent_file(path):
             loaded = agent_file.read(path, device)

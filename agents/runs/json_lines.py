@@ -16,9 +16,7 @@ from megastep.atomic_files import AppendedFile, write_atomically
 
 
 class JsonLines:
-    """Appends lines to a file, unbuffered. Lines that a full disk refuses are written with the next
-    line; the first error is a warning.
-    """
+    """Appends lines to a file, unbuffered. What a full disk refuses is written with the next."""
 
     def __init__(self, path: Path | str):
         self.path, self.has_warned = Path(path), False
@@ -54,9 +52,7 @@ class JsonLines:
 
 
 def read(path: Path | str, kind: object = None) -> list[Row]:
-    """Returns the objects in a file, or of a kind from `typed_json`, else UserError. Skips damaged
-    lines with a warning, and silently a last line that a crash cut short.
-    """
+    """Returns the objects of a `kind` in a file, else UserError. Skips damaged lines, and warns."""
     if kind is None:
         return [row for row, _ in _intact_lines(Path(path))]
     with user_errors(f"{path} cannot be used: "):
@@ -66,9 +62,7 @@ def read(path: Path | str, kind: object = None) -> list[Row]:
 
 
 def truncate_after(path: Path | str, step: int) -> None:
-    """Removes damaged lines and those after `step`, which a resumed run writes again. OSError, and
-    the file is unchanged, if there is no space for a copy.
-    """
+    """Removes damaged lines and those after `step`. If there is an OSError, nothing."""
     path = Path(path)
     if not path.exists():
         return

@@ -33,9 +33,7 @@ def members(root: Path) -> list[Path]:
 
 
 def score_of(folder: Path, ranked_by: str = RUNNING) -> float | None:
-    """Returns a member's last evaluated return, else the mean return of its last reports; if its
-    population ranks by another episode statistic, the mean of that.
-    """
+    """Returns a member's last evaluated, else mean return, or what its population ranks by."""
     rows = json_lines.read(folder / "metrics.jsonl", typed_json.Metrics)
     if ranked_by not in (RUNNING, EVALUATED):
         return scores.mean(rows, ranked_by)
@@ -67,9 +65,7 @@ def member(root: Path, which: int | str = "best") -> Path:
 
 
 def common_checkpoints(root: Path) -> list[Path]:
-    """Returns each member's newest checkpoint after one number of samples, all intact; none if only
-    some have a first one. UserError if there is none for another reason.
-    """
+    """Returns all members' newest intact checkpoints of one step; none if some have no first."""
     by_step = []
     for folder in members(root):
         paths = checkpoint.list_checkpoints(folder / "checkpoints")
@@ -88,9 +84,7 @@ def common_checkpoints(root: Path) -> list[Path]:
 
 
 def beginning(root: Path) -> checkpoint.Checkpoint:
-    """Returns what the first member of a population begins with, as a checkpoint without a state.
-    Raises UserError if its settings cannot be read.
-    """
+    """Returns what the first member begins with, as a checkpoint without a state. UserError."""
     path = folder_of(root, 0) / "config.yaml"
     config = {"train": typed_json.read_yaml(path), "spaces": {}}
     with user_errors(f"{path} cannot be read: "):
@@ -100,9 +94,7 @@ def beginning(root: Path) -> checkpoint.Checkpoint:
 
 
 def read(path: Path) -> list[list[Row]]:
-    """Returns the rows of `population.jsonl`, a list for each generation, each in the order of
-    members. Raises UserError if the file cannot be read, or holds something else.
-    """
+    """Returns the rows of `population.jsonl` by generation and member. UserError."""
     with user_errors(f"{path} does not hold the generations of a population; {INIT}: "):
         rows = json_lines.read(path)
         typed_json.check(list[typed_json.Generation], rows)

@@ -20,9 +20,7 @@ FILE = "provenance.jsonl"
 
 
 def record(folder: Path, samples: int, device: torch.device, hosts: Sequence[str] = ()) -> None:
-    """Appends a line to a run's `provenance.jsonl`, after so many samples, on a device and on the
-    machine of each rank. Never raises; unknown facts are omitted.
-    """
+    """Appends a line to a run's `provenance.jsonl`. Never raises; unknown facts are omitted."""
     with contextlib.suppress(Exception), open(folder / FILE, "a") as file:
         facts = {
             "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
@@ -37,9 +35,7 @@ def record(folder: Path, samples: int, device: torch.device, hosts: Sequence[str
 
 
 def made_with(device: torch.device, n_ranks: int = 1) -> dict[str, str | int]:
-    """Returns versions, device, threads and ranks. Runs that agree in these, in code and in
-    configuration, the seed included, are bit-identical.
-    """
+    """Returns versions, device, threads and ranks, all that bits depend on beside the settings."""
     facts = {"torch": torch.__version__, "megastep": package.version()}
     if n_ranks > 1:
         facts["ranks"] = n_ranks

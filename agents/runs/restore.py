@@ -1,6 +1,4 @@
-"""What a checkpoint or an agent file becomes: a policy that acts, weights to learn from, and what
-wrappers have learnt.
-"""
+"""What a checkpoint becomes: a policy that acts, weights to learn from, wrappers' state."""
 
 from typing import TYPE_CHECKING, cast
 
@@ -46,9 +44,7 @@ def policy_of(
 
 
 def load_weights(policy: Policy, loaded: "Checkpoint", env: Env | None = None) -> Policy:
-    """Returns a policy with a checkpoint's weights, the critic's too if both have one. Raises
-    UserError if they, or the spaces of `env`, do not fit.
-    """
+    """Returns a policy with a checkpoint's weights. UserError if weights or spaces do not fit."""
     saved, present = loaded.config["spaces"], {} if env is None else spaces_of(env)
     if present and (names := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]):
         changes = [f"{name} was {saved.get(name)} and is {present.get(name)}" for name in names]
@@ -72,9 +68,7 @@ def load_weights(policy: Policy, loaded: "Checkpoint", env: Env | None = None) -
 
 
 def load_wrappers(env: Env, loaded: "Checkpoint", is_frozen: bool = True) -> None:
-    """Gives the wrappers of an environment what those of a checkpoint's have learnt, which stays as
-    it is if frozen. Raises UserError if the environment is not in the same wrappers.
-    """
+    """Gives an environment's wrappers what a checkpoint's have learnt. UserError if others."""
     if state := (loaded.state or {}).get("wrappers"):
         load = optional(env, "load_wrapper_state")
         with user_errors(f"{loaded.path} cannot be used here: "):

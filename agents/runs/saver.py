@@ -153,9 +153,7 @@ class Saver:
         self._is_given_up.set()
 
     def wait(self) -> None:
-        """Waits until the last checkpoint is written. Warns if the disk failed, and raises any
-        other error of the thread.
-        """
+        """Waits until the last checkpoint is written. Warns if the disk failed."""
         if self._thread is None:
             return
         self._thread.join()
@@ -204,9 +202,7 @@ def _on_host(node, path, pinned, devices) -> object:
 
 
 def check_plain(tree: object, name: str) -> None:
-    """Raises TypeError, naming the path in a tree of this name, for what cannot be loaded without
-    running code. A tree may hold tensors, numbers, strings, None, lists, tuples and dicts.
-    """
+    """TypeError, naming the path, for what a `weights_only` checkpoint cannot hold."""
     if isinstance(tree, (dict, list, tuple)):
         for key, part in tree.items() if isinstance(tree, dict) else enumerate(tree):
             check_plain(part, f"{name}.{key}")

@@ -11,9 +11,7 @@ OTHERWISE = "env", "geometry", "greedy", "against", "max_steps"
 
 
 def mean(rows: list[Row], name: str = "return", n_reports: int = 10) -> float | None:
-    """Returns the mean return, or another statistic, of the episodes in the last reports of
-    `metrics.jsonl`, each once although windows overlap. None if none has one.
-    """
+    """Returns the mean of a statistic over the last reports, each episode once, or None."""
     total, n_episodes, end = 0.0, 0, len(rows)
     while end > max(0, len(rows) - n_reports):
         n_in_mean = rows[end - 1].get("episode/window", 0)

@@ -101,9 +101,7 @@ def dumps(value: Any, indent: int | None = None) -> str:
 
 
 def loads(text: str | bytes, kind: object = None) -> Any:
-    """The inverse of `dumps`. Raises ValueError for a text that `dumps` cannot have written, or a
-    value that is not of a kind, such as `Manifest`. More keys than those of the kind may be there.
-    """
+    """The inverse of `dumps`. ValueError for other texts, and for values not of the `kind`."""
     try:
         value = json.loads(text, object_hook=_decoded)
     except RecursionError:

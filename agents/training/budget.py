@@ -120,9 +120,7 @@ def read_record(folder: Path | str) -> array:
 
 
 class AnnealingRecord:
-    """A callback that appends to a run's record, whose factors after `n_updates` are removed. What
-    a full disk refuses is written later.
-    """
+    """A callback that appends to a run's record, whose factors after `n_updates` are removed."""
 
     def __init__(self, folder: Path | str, n_updates: int = 0):
         n_updates = min(n_updates, len(read_record(folder))) if n_updates else 0

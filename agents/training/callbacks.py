@@ -134,9 +134,7 @@ class NonFiniteGuard:
         return self.tolerates_divergence or self.check(trainer.rollout)
 
     def check(self, rollout: RolloutLike) -> bool:
-        """Returns True if the last update was applied, False if it was skipped. Synchronises.
-        Raises NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
-        """
+        """Returns whether the last update was applied. NonFiniteError: many were skipped."""
         if self.nonfinite_check is None:
             return True
         value, n_skipped = self.nonfinite_check.read(rollout.floats())

@@ -1,6 +1,4 @@
-"""Environments of Gymnasium and PettingZoo that step one after the other in one process. Workers
-import this file, so without PyTorch.
-"""
+"""Environments of Gymnasium and PettingZoo in this process, or a worker's: without PyTorch."""
 
 import copy
 import importlib
@@ -201,9 +199,7 @@ class HostedEnvs(Hosted):
 
 
 class ParallelEnvs(Hosted):
-    """N parallel environments of PettingZoo, with a row per agent, or turn-based ones that it can
-    convert. `present`, (B,) bool, also in infos, are agents that act in the next step.
-    """
+    """N parallel environments of PettingZoo. `present`, (B,) bool: agents of the next step."""
 
     def __init__(
         self,

@@ -1,6 +1,4 @@
-"""An episode of random actions in an environment of Gymnasium, which finds what cannot be asked of
-it, and the running statistics of its wrappers. Workers import it, so without PyTorch.
-"""
+"""An episode of random actions, which finds what cannot be asked; statistics of wrappers."""
 
 import contextlib
 import copy

@@ -1,7 +1,4 @@
-"""Steps Gymnasium's environments in worker processes, one per CPU core.
-
-Workers import Gymnasium and what the environments need, but not PyTorch.
-"""
+"""Gymnasium's environments in worker processes, one per core, which do without PyTorch."""
 
 import contextlib
 import multiprocessing

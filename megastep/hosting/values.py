@@ -1,6 +1,4 @@
-"""Checks observations and action masks of environments of Gymnasium and PettingZoo. Workers import
-it, so without PyTorch.
-"""
+"""Checks of observations and action masks. Workers import it, so without PyTorch."""
 
 from collections.abc import Iterator, Mapping
 
@@ -17,9 +15,7 @@ CHECKED_STEPS = 100
 
 
 def beyond_bounds(space: Space, batch: Tree, path: str = "it") -> Iterator[tuple[str, bool]]:
-    """Yields which observations of a batch (B, ...) are beyond the bounds of their space, as
-    clauses, and whether the space is a Box, by whose bounds nothing is scaled.
-    """
+    """Yields a clause for an observation beyond its space, and whether that is a Box."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         for key, part in space.items() if isinstance(space, spaces.Dict) else enumerate(space):
             yield from beyond_bounds(part, batch[key], f"its part {key!r}")
@@ -38,9 +34,7 @@ def beyond_bounds(space: Space, batch: Tree, path: str = "it") -> Iterator[tuple
 
 
 def masked_actions(space: Space, info: object) -> int:
-    """Returns the number of actions of the mask ``info["action_mask"]``: 0 if there is none, -1 if
-    it is not a number per action of a Discrete space.
-    """
+    """Returns the number of actions of ``info["action_mask"]``; 0: none, -1: of no Discrete."""
     mask = info.get("action_mask") if isinstance(info, Mapping) else None
     if mask is None:
         return 0
@@ -52,9 +46,7 @@ def masked_actions(space: Space, info: object) -> int:
 
 
 def allowed_actions(info: Mapping, n: int, place: str) -> np.ndarray:
-    """Returns the mask of an ``info``, (n,) bool. None, or one that allows nothing, as at an
-    episode's end, allows all. Raises BadValue if it has another shape.
-    """
+    """Returns an info's mask, (n,) bool; one that allows nothing allows all. BadValue."""
     mask = np.asarray(info.get("action_mask", np.ones(n)), bool)
     if mask.shape != (n,):
         clause = f"info['action_mask'] has shape {mask.shape}, and before it had ({n},)"

@@ -10,25 +10,14 @@ from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.settings import checked
 from megastep.types import Env, Tree, n_lanes
-from megastep.wrappers.base import Draws, Levels, Wrapper, along
+from megastep.wrappers.base import Draws, Levels, Unmasked, Wrapper, along, zero_actions
 
 __all__ = ["NoisyActions", "StickyActions", "TimeLimit"]
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 
-class _Random(Wrapper):
-    """Base of the two below, which know no masks."""
-
-    def after(self, world: arrdict) -> arrdict:
-        if "mask" in world:
-            raise ValueError(
-                f"{type(self).__name__} would take actions that the environment's mask forbids"
-            )
-        return world
-
-
-class StickyActions(_Random):
+class StickyActions(Unmasked):
     """Repeats a lane's last action with a probability, whatever the policy chose (Machado et al.
     2018). The first action of an episode is always the policy's.
 
@@ -43,12 +32,7 @@ class StickyActions(_Random):
         super().__init__(env)
         self.probability, self.draws = probability, Draws(env, (), seed)
         self.is_first = torch.ones(n_lanes(env), dtype=torch.bool, device=env.device)
-
-        def zeros(space) -> torch.Tensor:
-            dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
-            return torch.zeros(n_lanes(env), *space.shape, dtype=dtype, device=env.device)
-
-        self.last = spaces.map(zeros, env.action_space)
+        self.last = zero_actions(env)
 
     def before(self, actions: Tree) -> Tree:
         """Returns the last actions in lanes that repeat them."""
@@ -65,7 +49,7 @@ class StickyActions(_Random):
         return super().after(world)
 
 
-class NoisyActions(_Random):
+class NoisyActions(Unmasked):
     """Replaces discrete actions by random ones with a probability, and adds noise to continuous
     ones.
 

@@ -5,7 +5,7 @@ from typing import cast
 
 import torch
 
-from megastep import engine
+from megastep import engine, spaces
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.modules.lifecycle import CounterGenerator
@@ -98,6 +98,16 @@ class Wrapper:
             )
 
 
+class Unmasked(Wrapper):
+    """Base of wrappers that change actions. ValueError: the environment has action masks."""
+
+    def after(self, world: arrdict) -> arrdict:
+        if "mask" in world:
+            name = type(self).__name__
+            raise ValueError(f"{name} would take actions that the environment's mask forbids")
+        return world
+
+
 class Draws:
     """Uniform numbers in [0, 1), equal on CPU and GPU, of a shape for each lane of an environment.
     A seed is from 0 to 2**64 - 1.
@@ -130,6 +140,16 @@ class Levels:
         if self.draws is not None:
             self.values.copy_(self.draws(reset)[:, 0])
         return self.values
+
+
+def zero_actions(env: Env, *rows: int) -> Tree:
+    """Returns zeros for the actions of each lane, (B, *rows, ...) per leaf."""
+
+    def zeros(space) -> torch.Tensor:
+        dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
+        return torch.zeros(n_lanes(env), *rows, *space.shape, dtype=dtype, device=env.device)
+
+    return spaces.map(zeros, env.action_space)
 
 
 def along(values: torch.Tensor, leaf: torch.Tensor) -> torch.Tensor:

@@ -12,14 +12,14 @@ from megastep.arrdict import arrdict
 from megastep.modules.robots import headings
 from megastep.settings import checked
 from megastep.types import Env, Tree, n_lanes
-from megastep.wrappers.base import Draws, Wrapper, along
+from megastep.wrappers.base import Draws, Unmasked, Wrapper, along, zero_actions
 
 __all__ = ["Latency", "OdometryDrift"]
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-class Latency(Wrapper):
+class Latency(Unmasked):
     """Takes each action some steps late. Until then an episode's actions are 0.
 
     Args:
@@ -41,12 +41,7 @@ class Latency(Wrapper):
         super().__init__(env)
         self.n, self.draws = n, Draws(env, (), seed) if per_episode else None
         self.delays = torch.full((n_lanes(env),), n, device=env.device)
-
-        def zeros(space) -> torch.Tensor:
-            dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
-            return torch.zeros(n_lanes(env), n + 1, *space.shape, dtype=dtype, device=env.device)
-
-        self.last = spaces.map(zeros, env.action_space)  # the newest first
+        self.last = zero_actions(env, n + 1)  # the newest first
 
     def before(self, actions: Tree) -> Tree:
         """Returns the actions of some steps ago."""
@@ -60,8 +55,7 @@ class Latency(Wrapper):
 
     def after(self, world: arrdict) -> arrdict:
         """Forgets actions, and draws delays, where episodes begin."""
-        if "mask" in world:
-            raise ValueError("Latency would take actions that the environment's mask forbids")
+        world = super().after(world)
         if self.draws is not None:
             self.delays.copy_(self.draws(world.reset)[:, 0] * (self.n + 1))
 

@@ -257,7 +257,7 @@ def test_tensorboard_has_the_result_of_a_run(tmp_path):
         "seed": "number_value",
         "learner.lr": "number_value",
         "learner.names": "string_value",
-        "desync": "bool_value",
+        "desync": "string_value",
     }
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 #: Of the film in TensorBoard, which shows GIFs: pixels, and frames.
 HEIGHT, N_FRAMES = 360, 100
-WRITER, PLUGIN = "torch.utils.tensorboard", "tensorboard.plugins.hparams"
+WRITER = "torch.utils.tensorboard"
 
 
 class TensorBoard:
@@ -48,18 +48,18 @@ class TensorBoard:
     def finish(self, step: int, result: RunResult) -> None:
         """Writes the result of the run."""
         from tensorboard.compat.proto import summary_pb2
+        from torch.utils.tensorboard import summary
 
         Summary = summary_pb2.Summary  # pyright: ignore[reportAttributeAccessIssue]
-        plain = bool, int, float, str, type(None)  # None is left out
-        settings = {
-            name: value if isinstance(value, plain) else str(value)
+        settings = {  # None is left out, and bools would become numbers
+            name: value if type(value) in (int, float, type(None)) else str(value)
             for name, value in spaces.leaves(self.config).items()
         }
         numbers = {f"final/{name}": value for name, value in result.numbers.items()}
         writer = self.writer.file_writer
         assert writer is not None
-        for summary in hparams(settings, numbers):
-            writer.add_summary(summary, step)
+        for one in summary.hparams(settings, numbers):
+            writer.add_summary(one, step)
         for name, value in numbers.items():
             self.writer.add_scalar(name, value, step)
         if result.table:
@@ -75,24 +75,3 @@ class TensorBoard:
         """Waits until everything is written."""
         if "writer" in vars(self):
             self.writer.close()
-
-
-def hparams(settings: dict, numbers: dict) -> tuple:
-    """Returns the summaries of settings and final numbers, in which bools stay bools."""
-    from torch.utils.tensorboard import summary
-
-    kinds = importlib.import_module(f"{PLUGIN}.api_pb2")
-    plugin = importlib.import_module(f"{PLUGIN}.plugin_data_pb2")
-    written = experiment, start, _ = summary.hparams(settings, numbers)
-    flags = {name: value for name, value in settings.items() if isinstance(value, bool)}
-    about_all, of_run = (one.value[0].metadata.plugin_data for one in (experiment, start))
-    data = plugin.HParamsPluginData.FromString(about_all.content)
-    for info in data.experiment.hparam_infos:
-        if info.name in flags:
-            info.type = kinds.DATA_TYPE_BOOL
-    about_all.content = data.SerializeToString()
-    data = plugin.HParamsPluginData.FromString(of_run.content)
-    for name, value in flags.items():
-        data.session_start_info.hparams[name].bool_value = value
-    of_run.content = data.SerializeToString()
-    return written

@@ -1,12 +1,13 @@
 """Ranks share an evaluation: together they play what one process plays."""
 
+import contextlib
 from collections import Counter
 
 import pytest
 import torch
 
-from megastep.agents.distributed import shard
-from megastep.agents.distributed.shard import Shard
+from megastep.agents.distributed import process_group
+from megastep.agents.evaluation.eval_env import Shard
 from megastep.arrdict import arrdict
 
 
@@ -24,16 +25,17 @@ def test_every_home_is_played_as_often_as_by_one_process(n_envs, n_homes, n_rank
 def test_values_are_in_the_order_of_environments(monkeypatch):
     n_envs, n_homes, n_agents, n_ranks = 7, 3, 2, 2
     shards, parts = [Shard(n_envs, n_homes, rank, n_ranks) for rank in range(n_ranks)], []
-    monkeypatch.setattr(shard, "gather_objects", lambda values: parts.append(values) or [values])
-    monkeypatch.setattr(Shard, "_interleaved", lambda self, values: None, raising=True)
+    monkeypatch.setattr(process_group, "gather_objects", parts.append)
     for one in shards:
         local = torch.arange(len(one.envs)).repeat_interleave(n_agents)
         lanes = torch.tensor([*one.envs]).repeat_interleave(n_agents) * n_agents
         lanes += torch.arange(n_agents).repeat(len(one.envs))
-        values = dict(envs=local, homes=(local % len(one.homes)).int(), lanes=lanes)
-        one.with_others(arrdict(values, metrics=arrdict(twice=2.0 * lanes)))
-    monkeypatch.undo()
-    whole = shards[0]._interleaved(parts)
+        values = arrdict(envs=local, homes=(local % len(one.homes)).int(), lanes=lanes)
+        values["metrics"] = arrdict(twice=2.0 * lanes)
+        with contextlib.suppress(TypeError):  # of no parts
+            one.with_others(values)
+    monkeypatch.setattr(process_group, "gather_objects", lambda values: parts)
+    whole = shards[1].with_others(values)
     assert whole.lanes.tolist() == [*range(n_envs * n_agents)]
     assert whole.metrics.twice.tolist() == [2.0 * lane for lane in range(n_envs * n_agents)]
     assert whole.envs.tolist() == [lane // n_agents for lane in range(n_envs * n_agents)]
