@@ -3,16 +3,18 @@
 import torch
 
 from megastep import devices
+from megastep.agents.distributed import environment
 from megastep.agents.errors import user_errors
 
 
-def make_device(name: str, index: int | None = None) -> torch.device:
-    """Returns the device `auto`, `cpu`, `cuda` (the GPU `index`) or `cuda:1`, and makes a GPU the
-    current one. Raises UserError if there is none.
+def make_device(name: str) -> torch.device:
+    """Returns the device `auto`, `cpu`, `cuda`, of which each rank has its own, or `cuda:1`, and
+    makes a GPU the current one. Raises UserError if there is none.
     """
-    if index is not None and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
-        name = f"cuda:{index}"
-    with user_errors(kinds=(devices.EngineError,)):
+    with user_errors(kinds=(ValueError, devices.EngineError)):
+        info = environment.rank_info()
+        if info and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
+            name = f"cuda:{info.local_rank}"
         device = devices.device(name)
     if device.type == "cuda":
         torch.cuda.set_device(device)  # on which graphs are captured

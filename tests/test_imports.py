@@ -51,8 +51,8 @@ ENGINE = (
 )
 AGENTS = (
     ("errors", "generator", "package", "types"),
-    ("distributed", "hardware"),
-    ("console", "networks"),
+    ("distributed",),
+    ("console", "hardware", "networks"),
     ("storage",),
     ("algorithms",),
     ("runs",),

@@ -106,12 +106,6 @@ def n_ranks() -> int:
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
-def local_rank() -> int | None:
-    """Returns this rank's index on its machine, which is its GPU's too; None without torchrun."""
-    info = rank_info()
-    return info and info.local_rank
-
-
 def rank_label() -> str:
     """Returns this rank's label for messages, such as `rank 1 on node-7`."""
     return f"rank {rank()} on {hostname()}"

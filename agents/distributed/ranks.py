@@ -1,7 +1,5 @@
 """The ranks that train one policy: what they exchange on the host and agree on per update."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
@@ -10,6 +8,7 @@ import torch
 
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.pooling import all_gather
+from megastep.agents.errors import UserError
 
 T = TypeVar("T")
 
@@ -77,7 +76,7 @@ class Ranks(NamedTuple):
         return process_group.gather_objects(value) if is_needed and self.n > 1 else [value]
 
     def check_drift(self, policy: torch.nn.Module, extra: Sequence[torch.Tensor] = ()) -> None:
-        """Raises DriftError on all ranks, naming the first parameter or buffer of a policy, or of
+        """Raises UserError on all ranks, naming the first parameter or buffer of a policy, or of
         what else a learner trains, whose bits differ. Synchronises.
         """
         if self.n == 1:
@@ -87,10 +86,11 @@ class Ranks(NamedTuple):
         rows = all_gather(checksums(tensors.values())).T.tolist()
         for name, sums in zip(tensors, rows, strict=True):
             if different := [f"rank {n}" for n, one in enumerate(sums) if one != sums[0]]:
-                raise DriftError(
-                    f"The ranks drift apart: policy.{name} differs on {', '.join(different)}; "
-                    "start all with the same options and packages; a learner of your own averages "
-                    "gradients with megastep.agents.distributed.pooling.average_gradients"
+                raise UserError(
+                    f"The ranks drift apart: policy.{name} differs on {', '.join(different)}. "
+                    "Earlier checkpoints are intact. Start all ranks with the same options and "
+                    "packages; a learner of your own averages gradients with "
+                    "megastep.agents.distributed.pooling.average_gradients"
                 )
 
 
@@ -101,10 +101,6 @@ ONE = Ranks()
 def world() -> Ranks:
     """Returns all ranks that torchrun or `ranks=` started."""
     return Ranks(process_group.rank(), process_group.n_ranks())
-
-
-class DriftError(RuntimeError):
-    """The ranks' weights differ, so they no longer train one policy."""
 
 
 def checksums(tensors: Iterable[torch.Tensor]) -> torch.Tensor:

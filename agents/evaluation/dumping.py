@@ -55,7 +55,7 @@ def run(cfg: settings.Dump) -> Path:
     env_settings = settings.changed_known(env_settings, resample=True)
     with env_failures.caught(env_settings, Path()):
         waves = Waves(cfg, env_settings, homes, loaded, device)
-        about = waves.about(cfg, env_settings, geometry, loaded)
+        about = waves.about(env_settings, geometry)
         _claim(folder, about)
         staged = folder if cfg.format == "npz" else folder / STAGED
         with folders.locked(folder), _tidied(folder, staged):
@@ -186,14 +186,14 @@ class Waves:
         self.fps, self._make = optional(sample, "fps"), lambda: self._made(sample)
         self.told: _Told | None = None
 
-    def about(self, cfg, env, geometry, loaded) -> dict[str, Any]:
+    def about(self, env: settings.Env, geometry: settings.Geometry) -> dict[str, Any]:
         """Returns what the dataset's file says."""
-        names = "episodes", "seed", "split", "greedy", "max_steps", "truth"
+        cfg, names = self.cfg, ("episodes", "seed", "split", "greedy", "max_steps", "truth")
         chosen = {name: getattr(cfg, name) for name in names}
-        chosen["player"] = cfg.bot if loaded is None else eval_env.name_of(loaded)
+        chosen["player"] = cfg.bot if self.loaded is None else eval_env.name_of(self.loaded)
         chosen |= dict(env=check.as_tree(env), geometry=check.as_tree(geometry))
-        about = dict(writer=data.WRITER, format=cfg.format, fps=float(self.fps))
         texts = {path: repr(space) for path, space in self.codec.spaces.items()}
+        about = dict(writer=data.WRITER, format=cfg.format, fps=float(self.fps))
         return dict(about, spaces=texts, settings=chosen)
 
     def _made(self, sample, seed=None) -> None:

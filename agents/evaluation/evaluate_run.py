@@ -27,7 +27,7 @@ def run(cfg: settings.Evaluate) -> Path:
     Of `geometry=suite` plays as many episodes in each source. With `cfg.against` plays duels; with
     `cfg.ratings` writes ratings.csv.
     """
-    start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
+    start, device = time.monotonic(), factory.make_device(cfg.device)
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
     env_settings, geometry, homes = factory.played_in(cfg, loaded)
     folder, rank = folders.folder_of(loaded.path), process_group.rank()

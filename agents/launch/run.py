@@ -19,7 +19,6 @@ from megastep.agents import console
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.process_group import from_rank_0, together
-from megastep.agents.distributed.ranks import DriftError
 from megastep.agents.errors import EnvFailed, UserError, memory_problem, user_errors
 from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.factory import make as factory
@@ -58,7 +57,7 @@ class Run:
     def __init__(self, cfg: settings.Train, team: Team | None):
         self.cfg, self.team = cfg, team
         self.is_first, self.n_ranks = process_group.rank() == 0, process_group.n_ranks()
-        self.device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
+        self.device = together(lambda: factory.make_device(cfg.device))
         self.progress = console.Progress()
 
     def run(self) -> Path:
@@ -158,8 +157,6 @@ class Run:
                 self.training.train(lambda: bool(numbers))
         except NonFiniteError as error:
             raise UserError(f"{error}. Earlier checkpoints are in {self.folder}", 1) from error
-        except DriftError as error:
-            raise UserError(f"{error}. Earlier checkpoints are in {self.folder}") from error
         except (MemoryError, RuntimeError) as error:
             problem = memory_problem(error)
             if not (problem or isinstance(error, engine.EngineError)):

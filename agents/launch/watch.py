@@ -6,8 +6,6 @@ whatever its other threads are blocked in. A rank that hangs but beats is left t
 time-outs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

@@ -1,7 +1,5 @@
 """Saves checkpoints of a run in the background, with the states of all ranks."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -117,20 +117,8 @@ class EpisodeStats:
             of_metrics = torch.stack([metrics[name].float() for name in self.metrics])
         if not isinstance(learns, torch.Tensor):
             learns = torch.full_like(done, learns)
-        sums, has_begun = self._count(reward, reset, done, learns, of_metrics, layouts)
-        began = torch.stack([self.began, self.newest.expand_as(self.began)])  # (2, B)
-        is_in = (began == self.numbers[:, None]).double()  # (K, 2, B)
-        columns = torch.cat([sums[0] * self.members[:, None, None], sums[1:]])  # (C, S, 2, B)
-        self.sums += (columns[:, :, None] * is_in).sum((3, 4))
-        # in place, as a CUDA graph wants it
-        self.began.copy_(torch.where(has_begun, self.newest, self.began))
-
-    def _count(
-        self, reward, reset, done, learns, metrics, layouts
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns sums over ended episodes, (1 + sources, S, 2, B), and whether one began, (B,)."""
-        n_steps, n_lanes = reward.shape
-        n_columns = 1 + len(self.sources)
+        (n_steps, n_lanes), n_columns = reward.shape, 1 + len(self.sources)
+        # over episodes that end here, of all lanes and each source: began before, or here
         sums = self.sums.new_zeros(n_columns, self.sums.shape[1], 2, n_lanes)
         has_begun = torch.empty_like(self.is_whole)
         launch(
@@ -139,14 +127,19 @@ class EpisodeStats:
             reset=reset.contiguous(),
             done=done.contiguous(),
             learns=learns.contiguous(),
-            metrics=metrics,
-            layouts=layouts.contiguous() if self.sources else None,
+            metrics=of_metrics,
+            layouts=None if layouts is None or not self.sources else layouts.contiguous(),
             source_of_layout=self.source_of_layout if self.sources else None,
             **dict(totals=self.totals, is_whole=self.is_whole, has_begun=has_begun, sums=sums),
             **dict(n_metrics=len(self.metrics), n_layouts=len(self.source_of_layout)),
             **dict(n_steps=n_steps, n_lanes=n_lanes, n_threads=threads(), limit=LIMIT),
         )
-        return sums, has_begun
+        began = torch.stack([self.began, self.newest.expand_as(self.began)])  # (2, B)
+        is_in = (began == self.numbers[:, None]).double()  # (K, 2, B)
+        columns = torch.cat([sums[0] * self.members[:, None, None], sums[1:]])  # (C, S, 2, B)
+        self.sums += (columns[:, :, None] * is_in).sum((3, 4))
+        # in place, as a CUDA graph wants it
+        self.began.copy_(torch.where(has_begun, self.newest, self.began))
 
     def pop(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums

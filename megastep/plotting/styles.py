@@ -1,7 +1,5 @@
 """How pictures look: colours of the two themes, and settings that hold inside a ``with`` block."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Iterator

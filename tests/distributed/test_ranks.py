@@ -154,5 +154,5 @@ def test_first_difference_names_tensor_and_ranks(monkeypatch):
 
     monkeypatch.setattr(ranks, "all_gather", gather)
     text = "policy.0.bias differs on rank 1, rank 2; .*average_gradients"
-    with pytest.raises(ranks.DriftError, match=text):
+    with pytest.raises(UserError, match=text):
         Ranks(0, 3).check_drift(network)
