@@ -87,8 +87,8 @@ class Ranks(NamedTuple):
         for name, sums in zip(tensors, rows, strict=True):
             if different := [f"rank {n}" for n, one in enumerate(sums) if one != sums[0]]:
                 raise UserError(
-                    f"The ranks drift apart: policy.{name} differs on {', '.join(different)}. "
-                    "Earlier checkpoints are intact. Start all ranks with the same options and "
+                    f"The ranks drift apart: policy.{name} differs on {', '.join(different)}; "
+                    "earlier checkpoints are intact. Start all ranks with the same options and "
                     "packages; a learner of your own averages gradients with "
                     "megastep.agents.distributed.pooling.average_gradients"
                 )
