@@ -10,12 +10,7 @@ from torch.utils import _pytree
 
 from megastep.agents import console
 from megastep.agents.generator import SeededGenerator
-from megastep.agents.selfplay.mixed_policy import (
-    MixedPolicy,
-    rotating_teams,
-    score_pairs,
-    teams_of,
-)
+from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_teams, score_pairs, teams_of
 from megastep.agents.storage.collector import capture_with
 from megastep.arrdict import arrdict
 from megastep.types import Env, PolicyLike, Tree, World, n_lanes, optional

@@ -11,18 +11,9 @@ import torch
 from megastep import contract, engine, scene, spaces, types
 from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
-from megastep.agents.factory import check, components
+from megastep.agents.factory import check, components, settings
 from megastep.agents.factory.components import env_name, label
-from megastep.agents.factory.settings import (
-    Agent,
-    Env,
-    Geometry,
-    Learner,
-    Played,
-    Train,
-    Trained,
-    changed,
-)
+from megastep.agents.factory.settings import Agent, Env, Geometry, Learner, Played, Train, Trained
 from megastep.agents.generator import stream_seed
 from megastep.agents.hardware import make_device as make_device
 from megastep.agents.hardware import share_threads
@@ -141,7 +132,7 @@ def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
     names = [item["name"] if isinstance(item, dict) else item for item in env.wrappers]
     is_ours = all(":" not in name for name in names) and env.name.startswith("megastep.")
     n_envs = 1 if is_ours else min(SAMPLE, env.n_envs)
-    sample = construct(changed(env, n_envs=n_envs), geometries=geometries[:1], **arguments)
+    sample = construct(settings.changed(env, n_envs=n_envs), geometries=geometries[:1], **arguments)
     if not is_ours:
         with errors(f"{env.name}: "):
             contract.rollout(sample, SAMPLE_STEPS)
@@ -166,7 +157,7 @@ def check_memory(
             engine.fit(n_things, n_each * (total + n_bytes), sample.device, what)
         except engine.EngineError:
             if env.n_envs > PROBE:  # fewer tell for themselves whether they fit
-                probe = changed(env, n_envs=PROBE)
+                probe = settings.changed(env, n_envs=PROBE)
                 probe = construct(probe, geometries=geometries[:1], **arguments)
                 n_bytes += (_nbytes(probe) - total) / (PROBE - sample.n_envs)
                 engine.fit(n_things, n_each * n_bytes, sample.device, what)

@@ -18,13 +18,7 @@ from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.factory import check, conflicts, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
-from megastep.agents.runs import (
-    agent_file,
-    checkpoint,
-    folders,
-    provenance,
-    restore,
-)
+from megastep.agents.runs import agent_file, checkpoint, folders, provenance, restore
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training import budget, loggers
 from megastep.agents.training.callbacks import Snapshots
