@@ -19,7 +19,6 @@ from torch.autograd.function import once_differentiable
 
 from megastep import spaces
 from megastep.agents.networks.fused import aligned, aligned_rows, fused, has_hopper
-from megastep.agents.networks.intakes import Encoder
 from megastep.agents.networks.linear import cast as cast_weight
 from megastep.agents.networks.linear import compute_dtype, sum_rows
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
@@ -37,7 +36,7 @@ _BARRIER = 16  # bytes of shared memory that count copies
 _RESERVED = 1024  # bytes of shared memory that each block takes besides its own
 
 
-class Cnn(Encoder):
+class Cnn(nn.Module):
     """Three convolutions of an image in both directions, (..., A, C, H, W) -> (..., n_features):
     those of Mnih et al. 2015 for images of 36 x 36 pixels and more, of 3 x 3 pixels for smaller
     ones. Agents share weights.
@@ -69,7 +68,7 @@ class Cnn(Encoder):
         return self.layers(images).reshape(*obs.shape[:-4], self.n_features)
 
 
-class Conv(Encoder):
+class Conv(nn.Module):
     """Two convolutions along the rows of an image: (..., A, C, H, W) -> (..., n_features).
 
     The H rows count as channels, since images are one or a few pixels high. Agents share weights.

@@ -13,8 +13,7 @@ One with an attribute `adds_input` that is true adds x to its outputs if `is_res
 T time, B lanes, W width.
 """
 
-from collections.abc import Iterator
-from typing import Protocol, cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -32,18 +31,6 @@ CORES = {
 }
 
 
-class RecurrentCore(Protocol):
-    """A recurrent core, as the head of this file says."""
-
-    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the hidden state of B lanes at the start of an episode."""
-        ...
-
-    def __call__(
-        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, **options: bool
-    ) -> tuple[torch.Tensor, arrdict]: ...
-
-
 class Stack(nn.ModuleList):
     """Several cores with residual connections (He et al. 2016), which together are a core.
 
@@ -55,7 +42,8 @@ class Stack(nn.ModuleList):
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the hidden state of B lanes at the start of an episode."""
-        return arrdict({str(i): c.initial(n_lanes, device) for i, c in enumerate(self._cores())})
+        cores: list[Any] = [*self]
+        return arrdict({str(i): c.initial(n_lanes, device) for i, c in enumerate(cores)})
 
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
@@ -64,22 +52,19 @@ class Stack(nn.ModuleList):
         total, after = None, arrdict()
         # On a GPU each core's kernel adds its input. On a CPU sums keep their order and bits.
         if is_residual and x.is_cuda:
-            for i, core in enumerate(self._cores()):
+            for i, core in enumerate(self):
                 x, after[str(i)] = with_residual(core, x, reset, state[str(i)])
             return x, after
-        for i, core in enumerate(self._cores()):
+        for i, core in enumerate(self):
             core_input = x if total is None else x + total
             outputs, after[str(i)] = core(core_input, reset, state[str(i)])
             total = outputs if total is None else total + outputs
         assert total is not None
         return x + total if is_residual else total, after
 
-    def _cores(self) -> Iterator[RecurrentCore]:
-        return cast("Iterator[RecurrentCore]", iter(self))
-
 
 def with_residual(
-    core: RecurrentCore, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+    core: nn.Module, x: torch.Tensor, reset: torch.Tensor, state: arrdict
 ) -> tuple[torch.Tensor, arrdict]:
     """Returns x plus the outputs of a core, and its state after the last step."""
     if getattr(core, "adds_input", False):
@@ -88,7 +73,7 @@ def with_residual(
     return x + outputs, state
 
 
-def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") -> RecurrentCore:
+def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") -> Any:
     """Returns a recurrent core, a name in `CORES` or an import path; several layers make a `Stack`.
     The activation is that of the core "none". ValueError if there is no such core, or it breaks the
     contract at the head of this file.

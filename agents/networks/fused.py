@@ -38,26 +38,27 @@ Operation = Callable[..., Any]
 
 
 def fused(
-    kernel: Operation, fits: Callable[..., bool], on_cpu: bool = False
-) -> Callable[[Operation], Any]:
+    kernel: Operation,
+    fits: Callable[..., bool],
+    on_cpu: bool = False,
+    operation: Operation | None = None,
+) -> Any:
     """Decorates an operation in PyTorch: `kernel` computes the same from the same arguments, if
     `fits` returns that it takes them. Only where a GPU is in use, unless it runs `on_cpu` too.
     """
+    if operation is None:
+        return functools.partial(fused, kernel, fits, on_cpu)
+    name = f"{operation.__module__.rpartition('.')[2]}.{operation.__qualname__}"
+    OPERATIONS.add(name)
 
-    def decorate(operation: Operation) -> Operation:
-        name = f"{operation.__module__.rpartition('.')[2]}.{operation.__qualname__}"
-        OPERATIONS.add(name)
+    @functools.wraps(operation)
+    def chosen(*args, **options) -> object:
+        is_possible = name not in _plain and (on_cpu or uses_gpu())
+        if is_possible and fits(*args, **options):
+            return kernel(*args, **options)
+        return operation(*args, **options)
 
-        @functools.wraps(operation)
-        def chosen(*args, **options) -> object:
-            is_possible = name not in _plain and (on_cpu or uses_gpu())
-            if is_possible and fits(*args, **options):
-                return kernel(*args, **options)
-            return operation(*args, **options)
-
-        return chosen
-
-    return decorate
+    return chosen
 
 
 @contextlib.contextmanager

@@ -6,8 +6,7 @@ controls. An image leaf is (..., A, C, H, W).
 
 import itertools
 import math
-from collections.abc import Callable
-from typing import cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -32,22 +31,7 @@ _ROWS = LIBRARY.constants["NORMALISED_ROWS"]
 # ---- Encoders of a leaf ----
 
 
-class Encoder(nn.Module):
-    """Base of the encoders of a leaf, which map (..., *shape) to (..., n_features).
-
-    Attributes:
-        is_normalised: the input is normalised by running statistics.
-        takes_parts: the input is normalised, and may be a part of wider rows.
-        encode_runs: encodes all runs of an intake together, such as `Conv`'s. None: cannot.
-    """
-
-    n_features: int
-    is_normalised = True
-    takes_parts = False
-    encode_runs: Callable[..., torch.Tensor] | None = None
-
-
-class Flat(Encoder):
+class Flat(nn.Module):
     """Flattens a vector or an image: (..., *shape) -> (..., n_features)."""
 
     takes_parts = True
@@ -61,7 +45,7 @@ class Flat(Encoder):
         return obs.flatten(-self.n_axes)
 
 
-class OneHot(Encoder):
+class OneHot(nn.Module):
     """One-hot encoding of integers: (..., A) -> (..., A n)."""
 
     is_normalised = False
@@ -76,7 +60,7 @@ class OneHot(Encoder):
         return obs[..., None].eq(self.values).flatten(-2)
 
 
-class Categories(Encoder):
+class Categories(nn.Module):
     """One-hot encoding of MiniGrid's images, whose channels are kind, colour and state of a cell:
     (..., A, 3, H, W) -> (..., 21 A H W), the kinds of all cells first. ValueError for images of
     another number of channels.
@@ -104,7 +88,10 @@ class Categories(Encoder):
 
 
 #: Encoders of images by name. An encoder is a module `Encoder(space)` with `n_features` that maps
-#: images (..., A, C, H, W) to features (..., n_features).
+#: images (..., A, C, H, W) to features (..., n_features). Optional attributes:
+#:     is_normalised: the input is normalised by running statistics. Default: True.
+#:     takes_parts: the input is normalised, and may be a part of wider rows. Default: False.
+#:     encode_runs: encodes all runs of an intake together, such as `Conv`'s. Default: cannot.
 ENCODERS = {
     "linear": "megastep.agents.networks.intakes:Flat",
     "conv": "megastep.agents.networks.convolutions:Conv",
@@ -113,7 +100,7 @@ ENCODERS = {
 }
 
 
-def make_encoder(space: Space, image_encoder: str, path: str) -> Encoder:
+def make_encoder(space: Space, image_encoder: str, path: str) -> Any:
     """Returns the encoder of one leaf of an observation space, whose path messages name. Images
     have one of `ENCODERS`, or one of an import path. ValueError if the space is of an unknown kind,
     there is no such encoder, or its features have the wrong shape.
@@ -275,7 +262,7 @@ class ConcatIntake(nn.Module):
         others = [encoder for encoder in self.encoders if not isinstance(encoder, Flat)]
         if not others:  # one run, of all columns
             return columns
-        if (encode_runs := cast(Encoder, others[0]).encode_runs) is not None:
+        if encode_runs := getattr(others[0], "encode_runs", None):
             features = encode_runs(columns.flatten(0, -2), self.runs, self.encoders)
             return features.unflatten(0, columns.shape[:-1])
         features = []

@@ -39,21 +39,7 @@ _STRIP, _STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_TH
 
 # ---- The dtype, and casts of weights to it ----
 
-Weights = Callable[[], Iterable[torch.Tensor]]
-
-
-class _Casts(threading.local):
-    """What `cast` returned since the outermost `ComputeDtype` of this thread began."""
-
-    depth = 0
-    weights: Weights = tuple
-
-    def __init__(self) -> None:
-        # with the weights themselves, so that no other gets their id
-        self.by_weight: dict[tuple, tuple[object, torch.Tensor]] = {}
-
-
-_CASTS = _Casts()
+_THREAD = threading.local()  # its `context` is the innermost `ComputeDtype`, if there is one
 _MULTIPLE = 8  # rows that tensor cores want; the only padding of weights that are cast together
 _MAX_ROWS, _THREADS = LIBRARY.constants["CAST_ROWS"], LIBRARY.constants["CAST_THREADS"]
 
@@ -63,23 +49,27 @@ class ComputeDtype(torch.autocast):
     change inside it. Those that `weights` returns are cast together on a GPU.
     """
 
+    #: Weights and what `cast` returned of them, with the weights so that no other gets their id.
+    casts: dict[tuple, tuple[object, torch.Tensor]]
+
     def __init__(
-        self, device_type: str, dtype: torch.dtype, enabled: bool = True, weights: Weights = tuple
+        self,
+        device_type: str,
+        dtype: torch.dtype,
+        weights: Callable[[], Iterable[torch.Tensor]] = tuple,
     ):
-        super().__init__(device_type, dtype, enabled)
-        self._weights = weights
+        super().__init__(device_type, dtype)
+        self.weights = weights
 
     def __enter__(self) -> "Self":
-        self._outer_weights, _CASTS.weights = _CASTS.weights, self._weights
-        _CASTS.depth += 1
+        self.outer: ComputeDtype | None = getattr(_THREAD, "context", None)
+        self.casts = self.outer.casts if self.outer else {}
+        _THREAD.context = self
         super().__enter__()
         return self
 
     def __exit__(self, *args: object) -> None:
-        _CASTS.weights = self._outer_weights
-        _CASTS.depth -= 1
-        if not _CASTS.depth:
-            _CASTS.by_weight.clear()
+        _THREAD.context = self.outer
         super().__exit__(*args)
 
 
@@ -90,39 +80,37 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
     n_padding = -len(weight) % multiple
     if weight.dtype == dtype and not n_padding:
         return weight
-    key = id(weight), dtype, multiple
-    if key not in _CASTS.by_weight and _CASTS.depth and dtype == torch.bfloat16:
-        _cast_together(weight)
-    if key in _CASTS.by_weight:
-        return _CASTS.by_weight[key][1]
+    context, key = getattr(_THREAD, "context", None), (id(weight), dtype, multiple)
+    casts = context.casts if context else {}
+    if context and key not in casts and dtype == torch.bfloat16:
+        _cast_together(weight, context)
+    if key in casts:
+        return casts[key][1]
     result = weight.detach().to(dtype)
     if n_padding:
         result = torch.cat([result, result.new_zeros(n_padding, *weight.shape[1:])])
-    if _CASTS.depth:
-        _CASTS.by_weight[key] = weight, result
+    casts[key] = weight, result
     return result
 
 
 def cast_joined(weights: tuple[torch.Tensor, ...], dtype: torch.dtype) -> torch.Tensor:
     """Returns weights (N, n) each, cast as by `cast` and joined along columns: (N, sum of n)."""
-    key = *(id(weight) for weight in weights), dtype
-    if key in _CASTS.by_weight:
-        return _CASTS.by_weight[key][1]
-    result = torch.cat([cast(weight, dtype).detach() for weight in weights], 1)
-    if _CASTS.depth:
-        _CASTS.by_weight[key] = weights, result
-    return result
+    context, key = getattr(_THREAD, "context", None), (*map(id, weights), dtype)
+    casts = context.casts if context else {}
+    if key not in casts:
+        casts[key] = weights, torch.cat([cast(weight, dtype).detach() for weight in weights], 1)
+    return casts[key][1]
 
 
 @torch.no_grad()
-def _cast_together(weight) -> None:
+def _cast_together(weight, context) -> None:
     """Rounds all weights of the context to bfloat16 in one kernel, if this is one of them."""
-    weights = [w for w in _CASTS.weights() if w.dim() and is_plain_on_gpu(w)]
+    weights = [w for w in context.weights() if w.dim() and is_plain_on_gpu(w)]
     if not any(w is weight for w in weights):
         return
     for w, padded in zip(weights, rounded(weights), strict=True):
-        _CASTS.by_weight[id(w), torch.bfloat16, 1] = w, padded[: len(w)]
-        _CASTS.by_weight[id(w), torch.bfloat16, _MULTIPLE] = w, padded
+        context.casts[id(w), torch.bfloat16, 1] = w, padded[: len(w)]
+        context.casts[id(w), torch.bfloat16, _MULTIPLE] = w, padded
 
 
 def rounded(weights: list[torch.Tensor]) -> list[torch.Tensor]:

@@ -10,9 +10,7 @@ additions away.
 a GPU with clusters of blocks (Hopper and later). When acting, one kernel does a step (`step.py`).
 """
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import nn
@@ -56,27 +54,23 @@ _MAX_STEPS, _THREADS, _LANES, _BLOCK_UNITS = (
 )
 
 
-class Form(NamedTuple):
-    """A form of the recurrence with an explicit gradient."""
-
-    #: Returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output without a
-    #: residual and the last cell, (B, W) float32, and what `backward` needs.
-    forward: Callable[..., tuple]
-    #: Returns the gradients of the gates (T, B, 4 W), of the bias (4 W,), of the output and the
-    #: cell before the sequence, (B, W), and of the inputs, None if left to the caller.
-    backward: Callable[..., tuple]
-
-
-# ---- On a GPU with clusters of blocks: the recurrent weights stay on the chip ----
-
-
-def _fits_clusters(x, *_) -> bool:
+def _fits(x, *_) -> bool:
     n_steps, n_lanes, width = x.shape
+    if (x.device.type, x.dtype) == ("cpu", torch.float32):
+        return width % 16 == 0 and is_built_for_cpu()
     if not x.is_cuda or x.dtype != torch.bfloat16 or width not in WIDTHS or not n_lanes:
         return False
     n_bytes = max(CLUSTERS.constants[f"{way}_MEMORY_{width}"] for way in ("FORWARD", "BACKWARD"))
     # for one step, loading the weights takes too long
     return 2 <= n_steps <= _MAX_STEPS and has_hopper(x.device, n_bytes)
+
+
+# `_forward_...` returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output
+# without a residual and the last cell, (B, W) float32, and what `_backward_...` needs. That returns
+# the gradients of the gates (T, B, 4 W), of the bias (4 W,), of the output and the cell before the
+# sequence, (B, W), and of the inputs, None if left to the caller.
+
+# ---- On a GPU with clusters of blocks: the recurrent weights stay on the chip ----
 
 
 def _launch_clusters(direction, width, device, n_lanes, **fields) -> None:
@@ -125,36 +119,32 @@ def _backward_on_clusters(input_weight, weight, reset, saved, d_outputs, d_cell)
 # ---- On a CPU ----
 
 
-def _launch_on_cpu(direction, like, **fields) -> None:
-    n_steps, n_lanes, width = like.shape
-    fields |= dict(n_steps=n_steps, n_lanes=n_lanes, width=width, n_threads=threads())
-    launch(LIBRARY, f"lstm_sequence_{direction}", like.device, 0, **fields)
-
-
 def _forward_on_cpu(x, input_weight, bias, weight, reset, output, cell, saves, residual) -> tuple:
-    gates = x.new_empty((*x.shape[:2], 4 * x.shape[2]))
+    n_steps, n_lanes, width = x.shape
+    gates, last_cell = x.new_empty(n_steps, n_lanes, 4 * width), torch.empty_like(cell)
     hiddens, cells, outputs = (torch.empty_like(x) for _ in range(3))
-    last_cell = torch.empty_like(cell)
-    _launch_on_cpu(
-        *("forward", x),
+    launch(
+        *(LIBRARY, "lstm_sequence_forward", x.device, 0),
         **dict(x=x, input_weight=input_weight, bias=bias, weight=weight, reset=reset),
         **dict(first_output=output, first_cell=cell, gates=gates, hiddens=hiddens, cells=cells),
         **dict(outputs=outputs, last_cell=last_cell),
+        **dict(n_steps=n_steps, n_lanes=n_lanes, width=width, n_threads=threads()),
     )
     summed = outputs if residual is None else outputs + residual
     return summed, hiddens, outputs[-1].clone(), last_cell, (gates, cells)
 
 
 def _backward_on_cpu(input_weight, weight, reset, saved, d_outputs, d_cell) -> tuple:
-    gates, cells = saved
+    (gates, cells), (n_steps, n_lanes, width) = saved, d_outputs.shape
     d_gates, d_x, d_last = torch.empty_like(gates), torch.empty_like(d_outputs), cells[0]
     d_cell = torch.zeros_like(d_last) if d_cell is None else d_cell
     d_first_output, d_first_cell = torch.empty_like(d_last), torch.empty_like(d_last)
-    _launch_on_cpu(
-        *("backward", d_outputs),
+    launch(
+        *(LIBRARY, "lstm_sequence_backward", d_outputs.device, 0),
         **dict(input_weight=input_weight, weight=weight, reset=reset, gates=gates, cells=cells),
         **dict(d_outputs=d_outputs, d_last_cell=d_cell, d_gates=d_gates, d_x=d_x),
         **dict(d_output=d_first_output, d_cell=d_first_cell),
+        **dict(n_steps=n_steps, n_lanes=n_lanes, width=width, n_threads=threads()),
     )
     return d_gates, d_gates.flatten(0, 1).sum(0), d_first_output, d_first_cell, d_x
 
@@ -162,26 +152,25 @@ def _backward_on_cpu(input_weight, weight, reset, saved, d_outputs, d_cell) -> t
 # ---- The recurrence with an explicit gradient ----
 
 
-ON_CLUSTERS = Form(_forward_on_clusters, _backward_on_clusters)
-ON_CPU = Form(_forward_on_cpu, _backward_on_cpu)
-
-
 class _Sequence(torch.autograd.Function):
-    """Autograd would accumulate the weights' gradients step by step. Here each is one product."""
+    """Autograd would accumulate the weights' gradients step by step. Here each is one product. A
+    CPU's kernels are float32, those of clusters bfloat16.
+    """
 
     @staticmethod
     def forward(
-        ctx, form, has_grad, x, input_weight, bias, weight, reset, output, cell, is_residual
+        ctx, has_grad, x, input_weight, bias, weight, reset, output, cell, is_residual
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         ctx.set_materialize_grads(False)
-        ctx.form, ctx.is_residual = form, is_residual
+        ctx.on_cpu, ctx.is_residual = x.dtype == torch.float32, is_residual
         x, reset, output, cell = aligned(x), reset.contiguous(), aligned(output), aligned(cell)
         input_weight, bias, weight = (
             cast(w, x.dtype).contiguous() for w in (input_weight, bias, weight)
         )
         saves = has_grad and any(ctx.needs_input_grad)
         states, residual = (output, cell), x if is_residual else None
-        outputs, hiddens, last_output, last_cell, saved = form.forward(
+        forward = _forward_on_cpu if ctx.on_cpu else _forward_on_clusters
+        outputs, hiddens, last_output, last_cell, saved = forward(
             x, input_weight, bias, weight, reset, *states, saves, residual
         )
         ctx.save_for_backward(x, input_weight, weight, reset, hiddens, *saved)
@@ -196,7 +185,8 @@ class _Sequence(torch.autograd.Function):
             d_outputs = d_sum.clone()
             d_outputs[-1] += d_last_output
         d_cell = None if d_cell is None else aligned(d_cell)
-        d_gates, d_bias, d_output, d_cell, d_x = ctx.form.backward(
+        backward = _backward_on_cpu if ctx.on_cpu else _backward_on_clusters
+        d_gates, d_bias, d_output, d_cell, d_x = backward(
             input_weight, weight, reset, saved, d_outputs, d_cell
         )
         residual = d_sum if ctx.is_residual else None
@@ -205,26 +195,13 @@ class _Sequence(torch.autograd.Function):
         elif residual is not None:
             d_x += residual
         flat, by_kernel = d_gates.flatten(0, 1), (lambda d, rows: matmul(d.T, rows))
-        of_weights = by_kernel if ctx.form is ON_CPU else gradient_of_weights
+        of_weights = by_kernel if ctx.on_cpu else gradient_of_weights
         d_input, d_weight = (of_weights(flat, rows.flatten(0, 1)) for rows in (x, hiddens))
         d_states = None, d_output, d_cell, None
-        return None, None, d_x, d_input, d_bias.float(), d_weight, *d_states
+        return None, d_x, d_input, d_bias.float(), d_weight, *d_states
 
 
-def _by(form) -> Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    return lambda *inputs: _Sequence.apply(form, torch.is_grad_enabled(), *inputs)
-
-
-@fused(
-    _by(ON_CPU),
-    lambda x, *_: (
-        (x.device.type, x.dtype) == ("cpu", torch.float32)
-        and x.shape[-1] % 16 == 0
-        and is_built_for_cpu()
-    ),
-    on_cpu=True,
-)
-@fused(_by(ON_CLUSTERS), _fits_clusters)
+@fused(lambda *inputs: _Sequence.apply(torch.is_grad_enabled(), *inputs), _fits, on_cpu=True)
 def lstm_sequence(
     x: torch.Tensor,
     input_weight: torch.Tensor,

@@ -6,7 +6,6 @@ T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, 
 
 import copy
 import functools
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import torch
@@ -29,9 +28,10 @@ if TYPE_CHECKING:
 TRAINING_ONLY = ("critic.", "prediction.")
 
 
-def _name_in(table: Mapping[str, object]) -> AfterValidator:
-    """Returns a validator of names: a name in the table, or an import path."""
-    return AfterValidator(functools.partial(known_name, names=tuple(table)))
+_IsCore, _IsEncoder = (
+    AfterValidator(functools.partial(known_name, names=tuple(table)))
+    for table in (cores.CORES, intakes.ENCODERS)
+)
 
 
 class Policy(nn.Module):
@@ -80,9 +80,9 @@ class Policy(nn.Module):
         privileged_space: SkipValidation[Space | None] = None,
         *,
         width: Annotated[int, Field(ge=1, le=8192)] = 256,
-        core: Annotated[str | type, _name_in(cores.CORES)] = "lstm",
+        core: Annotated[str | type, _IsCore] = "lstm",
         layers: Annotated[int, Field(ge=1, le=8)] = 1,
-        encoder: Annotated[str | type, _name_in(intakes.ENCODERS)] = "linear",
+        encoder: Annotated[str | type, _IsEncoder] = "linear",
         activation: Literal["relu", "tanh"] = "relu",
         output: Literal["softmax", "duelling"] = "softmax",
         continuous: Literal["gaussian", "beta"] = "gaussian",
@@ -153,11 +153,11 @@ class Policy(nn.Module):
             generator: generator of the actions. Default: the policy's.
             options: further arguments of the output's `sample`, such as epsilon.
         """
-        obs, reset = mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None]
         if sample and generator is None:
             generator = self.generator.on(self.device)
         with self.compute_dtype():
-            features, state = self._features(obs, reset, state)
+            sequence = self.intake(world["obs"])[None], world["reset"][None]  # of one step
+            features, state = cores.with_residual(self.core, *sequence, state)
             if (mask := world.get("mask")) is not None:
                 options["mask"] = mask
             logits, actions, logprobs = self.output.act(features[0], sample, generator, **options)
@@ -276,14 +276,11 @@ class Policy(nn.Module):
         names = "logprobs", "entropies", "errors", "values", "features"
         return arrdict(zip(names, (*terms, features), strict=True))
 
-    def compute_dtype(self) -> ComputeDtype:
-        """Returns the autocast context of matrix products, in which each weight is cast once."""
-        return ComputeDtype(
-            self.device.type,
-            torch.bfloat16,
-            enabled=self.bf16 and self.device.type == "cuda",
-            weights=self.parameters,
-        )
+    def compute_dtype(self) -> torch.autocast:
+        """Returns the autocast context of matrix products. A weight is cast to bfloat16 once."""
+        if self.bf16 and self.device.type == "cuda":
+            return ComputeDtype("cuda", torch.bfloat16, self.parameters)
+        return torch.autocast(self.device.type, enabled=False)
 
     def actor(self) -> "Policy":
         """Returns a copy that only acts, with its own weights, which need no gradient."""

@@ -12,7 +12,7 @@ from torch import nn
 from megastep import engine
 from megastep.agents.networks import lstm as lstm_module
 from megastep.agents.networks.fused import aligned, plain_operations
-from megastep.agents.networks.lstm import LSTM, ON_CLUSTERS, ON_CPU, WIDTHS
+from megastep.agents.networks.lstm import LSTM, WIDTHS
 from megastep.arrdict import arrdict
 from tests.helpers.recurrent import assert_close
 
@@ -127,18 +127,25 @@ def test_only_a_residual_layer_adds_its_input():
 # ---- The kernels ----
 
 
-def sequence(form, device, dtype, x, reset, state, weights, d_outputs, d_cell, is_residual=False):
+def recurrence(by_kernel, *inputs):
+    if by_kernel:
+        return lstm_module._Sequence.apply(torch.is_grad_enabled(), *inputs)
+    return lstm_module.lstm_sequence(*inputs)
+
+
+def sequence(
+    by_kernel, device, dtype, x, reset, state, weights, d_outputs, d_cell, is_residual=False
+):
     """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU.
 
     Args:
-        form: of the recurrence; None: PyTorch's operations.
+        by_kernel: on a CPU in float32, by clusters in bfloat16. Else by PyTorch's operations.
     """
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
     inputs = *to, reset.to(device), *states, is_residual
     with plain_operations():
-        apply = lstm_module.lstm_sequence if form is None else lstm_module._by(form)
-        outputs, last, cell = apply(*inputs)
+        outputs, last, cell = recurrence(by_kernel, *inputs)
     assert is_residual or torch.equal(last, outputs[-1].float())
     assert outputs.dtype == dtype and cell.dtype == torch.float32
     grads = torch.autograd.grad(
@@ -167,7 +174,7 @@ def test_aligned_is_contiguous_in_16_byte_words(offset, shape):
 
 
 def whole_sequence(
-    form,
+    by_kernel,
     device,
     dtype,
     seed,
@@ -193,7 +200,7 @@ def whole_sequence(
     if nan_before_reset:
         inputs["reset"][n_steps // 2] = True
         inputs["x"][: n_steps // 2] = torch.nan
-    return sequence(form, device, dtype, **inputs, is_residual=is_residual)
+    return sequence(by_kernel, device, dtype, **inputs, is_residual=is_residual)
 
 
 @pytest.mark.parametrize(
@@ -204,9 +211,9 @@ def test_sequence_on_chip_matches_float32_in_every_order(
     cuda_on_cpu, monkeypatch, n_steps, n_lanes, is_residual, width
 ):
     case = 0, n_steps, n_lanes, False, is_residual, width
-    expected = whole_sequence(None, "cpu", torch.float32, *case)
+    expected = whole_sequence(False, "cpu", torch.float32, *case)
     cuda_on_cpu.install(monkeypatch)
-    case = ON_CLUSTERS, "cpu", torch.bfloat16, *case
+    case = True, "cpu", torch.bfloat16, *case
     results = cuda_on_cpu.in_every_order(lambda: whole_sequence(*case))
     assert_close(NAMES, results, expected, SLACK[torch.bfloat16])
     names = {f"lstm_sequence_{direction}_{width}" for direction in ("forward", "backward")}
@@ -215,8 +222,8 @@ def test_sequence_on_chip_matches_float32_in_every_order(
 
 def test_plain_sequence_in_bfloat16_matches_float32():
     case = 0, 5, 3, False, False, 16
-    results = whole_sequence(None, "cpu", torch.bfloat16, *case)
-    expected = whole_sequence(None, "cpu", torch.float32, *case)
+    results = whole_sequence(False, "cpu", torch.bfloat16, *case)
+    expected = whole_sequence(False, "cpu", torch.float32, *case)
     assert_close(NAMES, results, expected, SLACK[torch.bfloat16])
 
 
@@ -225,14 +232,14 @@ def test_plain_sequence_in_bfloat16_matches_float32():
 @pytest.mark.parametrize("n_steps, n_lanes", [(2, 1), (9, 33), (32, 1024), (17, 4100)])
 def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, width):
     x = torch.empty(n_steps, n_lanes, width, dtype=torch.bfloat16, device="cuda")
-    assert lstm_module._fits_clusters(x)
+    assert lstm_module._fits(x)
     case = 0, n_steps, n_lanes, False, False, width
-    first = whole_sequence(ON_CLUSTERS, "cuda", torch.bfloat16, *case)
-    second = whole_sequence(ON_CLUSTERS, "cuda", torch.bfloat16, *case)
+    first = whole_sequence(True, "cuda", torch.bfloat16, *case)
+    second = whole_sequence(True, "cuda", torch.bfloat16, *case)
     assert all(torch.equal(one, other) for one, other in zip(first, second, strict=True))
-    expected = whole_sequence(None, "cpu", torch.float32, *case)
+    expected = whole_sequence(False, "cpu", torch.float32, *case)
     assert_close(NAMES, first, expected, SLACK[torch.bfloat16])
-    by_steps = whole_sequence(None, "cuda", torch.bfloat16, *case)
+    by_steps = whole_sequence(False, "cuda", torch.bfloat16, *case)
     assert_close(NAMES, first, by_steps, SLACK[torch.bfloat16])
     first, by_steps = ([leaf.cpu() for leaf in leaves] for leaves in (first, by_steps))
     errors = [
@@ -249,7 +256,7 @@ def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, wi
 def test_sequence_on_chip_cuts_nan_at_resets():
     n_steps, n_lanes = 8, 50
     outputs, cell, d_x, *_, d_output, d_cell = whole_sequence(
-        ON_CLUSTERS, "cuda", torch.bfloat16, 1, n_steps, n_lanes, nan_before_reset=True
+        True, "cuda", torch.bfloat16, 1, n_steps, n_lanes, nan_before_reset=True
     )
     assert outputs[: n_steps // 2].isnan().any() and outputs[n_steps // 2 :].isfinite().all()
     assert cell.isfinite().all() and d_x[n_steps // 2 :].isfinite().all()
@@ -261,8 +268,8 @@ def test_sequence_on_chip_cuts_nan_at_resets():
 CPU_SLACK = 2e-5
 
 
-def on_cpu(kind, n_steps, n_lanes, width):
-    """Returns outputs, last cell and all gradients by the CPU's kernel, or by PyTorch (None)."""
+def on_cpu(by_kernel, n_steps, n_lanes, width):
+    """Returns outputs, last cell and all gradients by the CPU's kernel, or by PyTorch."""
     torch.manual_seed(0)
     inputs = [
         torch.randn(width, n_steps, n_lanes).permute(1, 2, 0),  # not contiguous
@@ -276,8 +283,7 @@ def on_cpu(kind, n_steps, n_lanes, width):
     reset = (torch.rand(n_lanes, n_steps) < 0.3).T
     d_results = torch.randn(n_steps, n_lanes, width), torch.randn(n_lanes, width)
     with plain_operations():
-        apply = lstm_module.lstm_sequence if kind is None else lstm_module._by(kind)
-        outputs, _, cell = apply(*inputs[:4], reset, *inputs[4:], False)
+        outputs, _, cell = recurrence(by_kernel, *inputs[:4], reset, *inputs[4:], False)
     results = outputs, cell
     return [*results, *torch.autograd.grad(results, inputs, d_results)]
 
@@ -286,15 +292,15 @@ def on_cpu(kind, n_steps, n_lanes, width):
     "shape", [(9, 5, 16), (1, 3, 48), (32, 64, 64), (3, 7, 256), (70, 1, 80)], ids=str
 )
 def test_cpu_sequence_matches_pytorch(shape):
-    expected = on_cpu(None, *shape)
-    assert_close(NAMES, on_cpu(ON_CPU, *shape), expected, CPU_SLACK)
+    expected = on_cpu(False, *shape)
+    assert_close(NAMES, on_cpu(True, *shape), expected, CPU_SLACK)
 
 
 def test_cpu_sequence_has_the_same_bits_with_any_number_of_threads():
     results = []
     for n_threads in (1, 2, 3):
         engine.set_threads(n_threads)
-        results.append(on_cpu(ON_CPU, 32, 65, 64))
+        results.append(on_cpu(True, 32, 65, 64))
     engine.set_threads(None)
     for other in results[1:]:
         assert all(map(torch.equal, results[0], other))
