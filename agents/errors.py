@@ -31,12 +31,6 @@ class UserError(Exception):
         self.code = self.code if code is None else code
 
 
-class EnvFailed(UserError):
-    """An environment of somebody else raised an error."""
-
-    code = 4
-
-
 class ConfigErrors(UserError):
     """All errors of one configuration: `errors`, (dotted key, sentence) each."""
 

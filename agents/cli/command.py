@@ -154,7 +154,7 @@ def with_member(tree: check.Tree, key: str) -> check.Tree:
     if member is None or not isinstance(run, str):
         return tree
     root = folders.find(run, None)
-    if not populations.is_root(root):
+    if not folders.is_population(root):
         raise ConfigErrors([("member", f"is of a population, and {run} is a single run")])
     if member != "best" and type(member) is not int:
         raise ConfigErrors([("member", f"{member!r} is neither a number nor best")])

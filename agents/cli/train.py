@@ -75,7 +75,7 @@ def prepare(tree: Tree, typed: list[str]) -> Tree:
         return tree
     how, allowed = given[0], {"resume": RESUMABLE, "rerun": REPEATABLE}.get(given[0], typed)
     path = folders.find(tree[how], "best" if how == "init" else None)
-    whole = populations.is_root(path)
+    whole = folders.is_population(path)
     allowed = [*allowed, *["ranks"] * whole]  # members have the same bits on any number of ranks
     if refused := [key for key in typed if not {key, key.split(".")[0]} & {*allowed}]:
         raise ConfigErrors((key, CURES[how]) for key in refused)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from megastep import engine
-from megastep.agents.errors import EnvFailed, UserError, memory_problem
+from megastep.agents.errors import UserError, memory_problem
 from megastep.agents.factory.settings import Env
 from megastep.hosting.env_error import EnvError, one_line
 from megastep.imports import import_object
@@ -15,6 +15,12 @@ from megastep.imports import import_object
 #: Has the traceback, in the run's folder.
 FILE = "env_error.txt"
 METHODS = "__init__", "reset", "step", "check", "desync"
+
+
+class EnvFailed(UserError):
+    """An environment of somebody else raised an error."""
+
+    code = 4
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ from megastep.agents import console
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.process_group import from_rank_0, together
-from megastep.agents.errors import EnvFailed, UserError, memory_problem, user_errors
+from megastep.agents.errors import UserError, memory_problem, user_errors
 from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.factory.trainer import make_trainer
@@ -95,7 +95,7 @@ class Run:
             caught = env_failures.caught(self.cfg.env, self.folder, rank=process_group.rank())
             try:
                 together(caught(lambda: self.make(source, token)))
-            except EnvFailed:
+            except env_failures.EnvFailed:
                 undo.pop_all()  # the folder has the traceback
                 raise
             self.began()

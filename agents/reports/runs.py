@@ -7,7 +7,7 @@ from typing import NamedTuple
 from megastep.agents.errors import UserError
 from megastep.agents.factory.check import leaves
 from megastep.agents.factory.components import label
-from megastep.agents.runs import folders, json_lines, scores, typed_json
+from megastep.agents.runs import config_yaml, folders, json_lines, scores, typed_json
 from megastep.agents.types import Config, Row
 
 #: Settings that differ between seeds of one experiment, or do not change what is learnt.
@@ -88,7 +88,7 @@ def read(folder: Path) -> Run:
     folder = folders.folder_of(folders.find(str(folder)))
     if not (folder / "config.yaml").exists():
         raise UserError(f"{folder} is not a run: it has no config.yaml")
-    config = typed_json.read_yaml(folder / "config.yaml")
+    config = config_yaml.read(folder / "config.yaml")
     names, kind = ("metrics.jsonl", "perf.jsonl"), typed_json.Metrics
     metrics, perf = (json_lines.read(folder / name, kind) for name in names)
     if not metrics:

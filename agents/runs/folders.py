@@ -8,13 +8,14 @@ import os
 import re
 import shlex
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from megastep.agents import console, package
+from megastep.agents import package
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.runs import agent_file, checkpoint, populations, trust, typed_json
+from megastep.agents.runs import agent_file, checkpoint, trust, typed_json
 
 if TYPE_CHECKING:
     import torch
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: File with the run folder of each start, one per line.
 STARTED = RUNS / "started.txt"
+#: The run folder of a population's first member, `populations.folder_of(root, 0)`.
+MEMBER = "member-0"
 #: Prefix of error messages.
 CANNOT = "{} cannot be written; choose another with folder=: "
 
@@ -91,7 +94,8 @@ def locked(folder: Path) -> Iterator[None]:
         with user_errors(CANNOT.format(folder)):
             if error.errno not in (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK):
                 raise
-        console.warn(f"{folder} is on a file system without locks; train in it only once at a time")
+        text = f"{folder} is on a file system without locks; train in it only once at a time"
+        warnings.warn(text, stacklevel=2)
     try:
         yield
     finally:
@@ -101,13 +105,21 @@ def locked(folder: Path) -> Iterator[None]:
 
 def record_start(folder: Path) -> None:
     """Records that training starts in a folder, which is `latest` from then on."""
-    with console.warned(f"{STARTED} cannot be written, so `latest` will not find {folder}: "):
+    try:
         RUNS.mkdir(exist_ok=True)
         with open(STARTED, "ab") as file:
             file.write(os.fsencode(folder) + b"\n")
+    except OSError as error:
+        text = f"{STARTED} cannot be written, so `latest` will not find {folder}: {error}"
+        warnings.warn(text, stacklevel=2)
 
 
 # ---- Existing folders ----
+
+
+def is_population(path: Path) -> bool:
+    """Returns whether a folder is that of a population."""
+    return (path / MEMBER).is_dir()
 
 
 def known() -> list[Path]:
@@ -115,7 +127,7 @@ def known() -> list[Path]:
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
     folders = {*RUNS.glob("*"), *SWEEPS.glob("*/*"), *order}
-    folders = [p for p in folders if (p / "checkpoints").is_dir() or populations.is_root(p)]
+    folders = [p for p in folders if (p / "checkpoints").is_dir() or is_population(p)]
     return sorted(folders, key=lambda path: (order.get(path, -1), str(path)))
 
 
@@ -132,7 +144,9 @@ def find(name: str, member: int | str | None = "best") -> Path:
     path = Path(name)
     if name == "latest" and (folders := known()):
         path = folders[-1]
-    if populations.is_root(path):
+    if is_population(path):
+        from megastep.agents.runs import populations  # slow to import
+
         return path if member is None else populations.member(path, member)
     is_run = any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints"))
     if is_run or (agent_file.is_agent_file(path) and os.path.isfile(path)):
@@ -185,6 +199,8 @@ def command_of(script: str, key: str, folder: Path) -> str:
 
 def to_continue(folder: Path | None) -> str:
     """Returns a sentence with the command that continues a run, or why it cannot be continued."""
+    from megastep.agents.runs import populations
+
     runs = [] if folder is None else populations.members(folder) or [folder]
     if folder is None or not all(checkpoint.list_checkpoints(run / "checkpoints") for run in runs):
         return "Nothing was saved yet"
@@ -200,7 +216,7 @@ def folder_of(path: Path) -> Path:
     """Returns the run folder of a path from `find`; for an agent file one for its results."""
     if agent_file.is_agent_file(path):
         return RUNS / f"pretrained-{path.stem}"
-    if populations.is_root(path):
+    if is_population(path):
         return path
     return path.parent.parent if checkpoints_of(path) == path else path
 
@@ -210,5 +226,5 @@ def name_of(path: Path) -> str:
     if agent_file.is_agent_file(path):
         return path.stem
     folder = folder_of(path)
-    is_member = populations.is_root(folder.parent)
+    is_member = is_population(folder.parent)
     return f"{folder.parent.name}/{folder.name}" if is_member else folder.name

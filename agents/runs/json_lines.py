@@ -12,7 +12,38 @@ from pathlib import Path
 from megastep.agents.errors import user_errors
 from megastep.agents.runs import typed_json
 from megastep.agents.types import Row
-from megastep.atomic_files import AppendedFile, write_atomically
+from megastep.atomic_files import write_atomically
+
+
+class AppendedFile:
+    """A file that bytes are appended to, cut to ``n_bytes`` first. Bytes that a full disk refuses
+    are in `unwritten`, and are written with the next. All methods raise OSError.
+    """
+
+    def __init__(self, path: Path, n_bytes: int | None = None):
+        self.path, self.unwritten = path, bytearray()
+        self.file = open(path, "ab", buffering=0)
+        if n_bytes is not None:
+            self.file.truncate(n_bytes)
+
+    def write(self, data: bytes) -> None:
+        self.unwritten += data
+        self.flush()
+
+    def flush(self) -> None:
+        """Writes `unwritten`."""
+        while self.unwritten:
+            del self.unwritten[: self.file.write(self.unwritten)]
+
+    def sync(self) -> None:
+        """Writes `unwritten` and flushes the file to disk."""
+        self.flush()
+        os.fsync(self.file.fileno())
+
+    def close(self) -> None:
+        """Writes `unwritten` and closes the file."""
+        with self.file:
+            self.flush()
 
 
 class JsonLines:

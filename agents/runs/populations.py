@@ -7,7 +7,7 @@ import itertools
 from pathlib import Path
 
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.runs import checkpoint, json_lines, scores, typed_json
+from megastep.agents.runs import checkpoint, config_yaml, json_lines, scores, typed_json
 from megastep.agents.types import Row
 
 FILE, PREFIX, KEY = "population.jsonl", "member-", "settings/"
@@ -19,11 +19,6 @@ INIT = "init=RUN starts a new run from the best member's weights"
 def folder_of(root: Path, member: int) -> Path:
     """Returns the run folder of a member."""
     return root / f"{PREFIX}{member}"
-
-
-def is_root(path: Path) -> bool:
-    """Returns whether a folder is that of a population."""
-    return folder_of(path, 0).is_dir()
 
 
 def members(root: Path) -> list[Path]:
@@ -45,7 +40,7 @@ def best(root: Path) -> int | None:
     """Returns the number of the first member with the highest score; None if none has one."""
     ranked_by, path = RUNNING, folder_of(root, 0) / "config.yaml"
     with contextlib.suppress(KeyError, TypeError):
-        ranked_by = typed_json.read_yaml(path)["population"]["score"] if path.exists() else RUNNING
+        ranked_by = config_yaml.read(path)["population"]["score"] if path.exists() else RUNNING
     found = [score_of(folder, ranked_by) for folder in members(root)]
     known = [score for score in found if score is not None]
     return found.index(max(known)) if known else None
@@ -86,7 +81,7 @@ def common_checkpoints(root: Path) -> list[Path]:
 def beginning(root: Path) -> checkpoint.Checkpoint:
     """Returns what the first member begins with, as a checkpoint without a state. UserError."""
     path = folder_of(root, 0) / "config.yaml"
-    config = {"train": typed_json.read_yaml(path), "spaces": {}}
+    config = {"train": config_yaml.read(path), "spaces": {}}
     with user_errors(f"{path} cannot be read: "):
         typed_json.check(typed_json.Config, config)
     numbers: dict[str, float] = dict(samples=0, seconds=0, updates=0)

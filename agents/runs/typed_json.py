@@ -1,6 +1,6 @@
-"""The reader of strings and numbers in the files of a run: JSON and YAML, checked against types.
+"""The reader of strings and numbers in the files of a run: JSON, checked against types.
 
-The JSON can also hold infinity, NaN, and dicts with keys other than strings:
+It can also hold infinity, NaN, and dicts with keys other than strings:
 
     {"cap": inf, "prices": {0: 1.0}}
     {"cap": {"$float": "inf"}, "prices": {"$dict": [[0, 1.0]]}}
@@ -9,15 +9,13 @@ The JSON can also hold infinity, NaN, and dicts with keys other than strings:
 import functools
 import json
 import math
-from pathlib import Path
 from typing import Annotated, Any, cast
 
 import pydantic
-import yaml
 from pydantic import BeforeValidator, Field
 from typing_extensions import NotRequired, TypedDict
 
-from megastep.agents.errors import shortened, user_errors
+from megastep.agents.errors import shortened
 
 FLOAT, DICT = "$float", "$dict"
 _Count = Annotated[int, Field(ge=0, lt=2**63)]
@@ -145,39 +143,3 @@ def _decoded(value: dict[str, Any]) -> Any:
         return dict(value[DICT]) if value.keys() == {DICT} else value
     except TypeError as error:
         raise ValueError(f"{value!r} is not what was saved: {error}") from None
-
-
-# ---- config.yaml, which may be a stranger's ----
-
-#: Most bytes of the file.
-MAX_BYTES = 100_000
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuses aliases, which unfold, and integers that cannot be printed."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise ValueError("it has an alias")
-        return super().compose_node(parent, index)
-
-    def construct_yaml_int(self, node: Any) -> int:
-        if abs(value := super().construct_yaml_int(node)) >= 2**64:
-            raise ValueError("it has an integer beyond 64 bits")
-        return value
-
-
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Returns the settings in a `config.yaml`. Raises UserError if it holds something else."""
-    # Exception: whatever YAML makes of a tag that its text does not fit
-    with user_errors(f"{path} does not hold the settings of a run: ", (Exception,)):
-        with open(path, "rb") as file:
-            text = file.read(MAX_BYTES + 1)
-        if len(text) > MAX_BYTES:
-            raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
-        config = yaml.load(text, _Loader)
-        check(ConfigYaml, config)
-        return config

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from megastep.atomic_files import AppendedFile
+from megastep.agents.runs.json_lines import AppendedFile
 
 #: The learning rate's factor (1 at first) in each update of a run, as one float64. With `seconds=`
 #: factors depend on the clock; by this file `rerun` repeats such a run.

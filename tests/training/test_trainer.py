@@ -17,6 +17,7 @@ from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.evaluation.in_training import Evaluations
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import checkpoint
+from megastep.agents.runs.json_lines import AppendedFile
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training import performance
 from megastep.agents.training.budget import AnnealingRecord, Budget
@@ -25,7 +26,6 @@ from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.performance import MAX_AHEAD
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
-from megastep.atomic_files import AppendedFile
 from tests.helpers.logged import Rows
 from tests.helpers.synchronisation import no_synchronisation
 from tests.helpers.weights import copied, same
