@@ -3,7 +3,6 @@
 import torch
 
 from megastep import devices
-from megastep.agents.distributed import environment
 from megastep.agents.errors import user_errors
 
 
@@ -11,6 +10,8 @@ def make_device(name: str) -> torch.device:
     """Returns the device `auto`, `cpu`, `cuda`, of which each rank has its own, or `cuda:1`, and
     makes a GPU the current one. Raises UserError if there is none.
     """
+    from megastep.agents.distributed import environment  # who acts has no ranks
+
     with user_errors(kinds=(ValueError, devices.EngineError)):
         info = environment.rank_info()
         if info and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):

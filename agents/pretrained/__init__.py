@@ -6,7 +6,8 @@ its name stands for a run: `evaluate.py run=NAME`; in Python `megastep.load(NAME
 
 from typing import TYPE_CHECKING
 
-from megastep.agents.hardware import make_device
+from megastep import devices
+from megastep.agents.errors import user_errors
 from megastep.agents.runs import folders, restore
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def load(name: str, device: str = "auto") -> "Policy":
             A path comes first.
         device: `auto`, `cpu`, `cuda` or `cuda:1`; `auto` is a GPU if there is one.
     """
-    where = make_device(device)
+    with user_errors(kinds=(devices.EngineError,)):
+        where = devices.device(device)
     loaded = folders.load_checkpoint(folders.find(name), False, where)
     return restore.policy_of(loaded, device=where)

@@ -9,11 +9,10 @@ import contextlib
 import os
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from megastep.agents.errors import UserError, shortened
-from megastep.agents.types import Config
 
 #: Settings groups that may contain import paths.
 GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum", "logger", "callbacks")
@@ -24,7 +23,7 @@ OWN = re.compile(
 )
 
 
-def foreign_names(config: Config) -> list[str]:
+def foreign_names(config: Mapping) -> list[str]:
     """Returns the import paths in a configuration that are not megastep's own."""
     train, names = config.get("train"), set()
     stack = [train.get(group) for group in GROUPS] if isinstance(train, dict) else []
@@ -57,7 +56,7 @@ def untrusted(names: Iterable[str]) -> list[str]:
     return [name for name in names if name not in known]
 
 
-def check(config: Config, source: object, cure: str = CURE) -> None:
+def check(config: Mapping, source: object, cure: str = CURE) -> None:
     """Raises UserError if a configuration in `source` names what may not be imported."""
     names = foreign_names(config)
     if names and (names := untrusted(names)):
