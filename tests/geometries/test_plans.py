@@ -505,6 +505,32 @@ def test_random_dialects_of_svg_give_the_same_plan():
         assert g.masks.max() == 2 and np.allclose(ends.real, true_ends.real, atol=0.01), text
 
 
+@pytest.mark.parametrize(
+    "smooth, spelt_out",
+    [  # after another kind of curve, S and T begin straight ahead (SVG 2, 9.3.6 and 9.3.7)
+        ("Q0 0 4 0S9 3 9 6", "Q0 0 4 0C4 0 9 3 9 6"),
+        ("C0 0 2-2 4 0T9 6", "C0 0 2-2 4 0L9 6"),
+        ("C0 0 2-2 4 0T9 0t0 6", "C0 0 2-2 4 0L9 0Q14 0 9 6"),
+        ("C0 0 2-2 4 0s5 3 5 6", "C0 0 2-2 4 0C6 2 9 3 9 6"),
+        ("Q0-2 4 0T9 6", "Q0-2 4 0Q8 2 9 6"),
+    ],
+)
+def test_smooth_curves_go_on_from_their_own_kind(smooth, spelt_out):
+    form = '<svg><path id="wall" fill="none" stroke="red" stroke-width=".2" d="M0 6{}L0 6z"/></svg>'
+    floors = [imports.svg.read(form.format(d).encode(), 1)[0].floor for d in (smooth, spelt_out)]
+    assert floors[0].symmetric_difference(floors[1]).area < 0.01 < 20 < floors[1].area
+
+
+@pytest.mark.parametrize("d", ["M4 3h0", "M4 3z", "M4 3L4 3", "M1 1M4 3l0 0z"])
+@pytest.mark.parametrize("cap, area", [("round", np.pi / 4), ("square", 1), ("butt", 0)])
+def test_a_pillar_may_be_a_dot(d, cap, area):
+    """Where a line has no length, its caps alone are drawn (SVG 2, 13.5.4)."""
+    room = '<path id="wall" fill="none" stroke="red" stroke-width="1" d="M0 0h8v6h-8z{}"/>'
+    text = f'<svg stroke-linecap="{cap}">{room}</svg>'
+    floor = imports.svg.read(text.format(d).encode(), 1)[0].floor
+    assert 7 * 5 - floor.area == pytest.approx(area, abs=0.01)
+
+
 def test_what_is_not_read_of_a_drawing_is_said():
     text = (STRANGERS / "00_reference.svg").read_text()
     for change, words in {

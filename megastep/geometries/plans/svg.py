@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 import svgelements
 from shapely.geometry.base import BaseGeometry
-from svgelements import Close, Color, Line, Matrix, Move, Path
+from svgelements import Close, Color, CubicBezier, Line, Matrix, Move, Path, QuadraticBezier
 
 from megastep.geometries.plans import outlines, safe
 from megastep.geometries.plans.outlines import Drawing
@@ -328,13 +328,15 @@ def _stroke(line, is_closed, half, style) -> BaseGeometry:
     """Returns the area within `half` of a line (P, 2), with the style's caps and joins."""
     is_step = np.abs(np.roll(line, -1, 0) - line).max(1) > 1e-9 * np.abs(line).max()
     is_step[-1] |= not is_closed
+    cap: Any = CAPS.get(style["stroke-linecap"], "flat")
+    if is_step.sum() < 2:  # a dot has caps alone
+        return shapely.Point(line[0]).buffer(half, cap_style=cap)
     line = line[is_step]
     join: Any = style["stroke-linejoin"]
-    cap: Any = CAPS.get(style["stroke-linecap"], "flat")
     closes = is_closed and len(np.unique(line, axis=0)) > 2
     if is_closed and not closes:  # there and back, with a join at either end
         cap = "round" if join == "round" else "flat"
-    path = (shapely.LinearRing if closes else shapely.LineString)(line if len(line) > 1 else [])
+    path = (shapely.LinearRing if closes else shapely.LineString)(line)
     limit = max(1.0, length(style["stroke-miterlimit"]))
     corners = np.array(path.coords) @ (1, 1j)
     steps = np.diff(np.append(corners, corners[1:2]) if closes else corners)
@@ -353,14 +355,25 @@ def _stroke(line, is_closed, half, style) -> BaseGeometry:
     return shapely.union_all([area, *(piece.buffer(half, **pens) for piece in pieces)])
 
 
+def _go_on(curve, before) -> None:
+    """Has a curve of `S` or `T` go on from its own kind alone; svgelements does from both."""
+    first, last = ("control1", "control2") if isinstance(curve, CubicBezier) else 2 * ("control",)
+    point = getattr(before, last) if type(before) is type(curve) else curve.start
+    setattr(curve, first, point.reflected_across(curve.start))
+
+
 def _lines(path) -> list[tuple[np.ndarray, bool]]:
     """Returns the lines of a path, or of what makes one, with its curves flattened."""
     lines, points = [], []
-    for segment in [*Path(path), Move((0, 0))]:
+    segments = [*Path(path), Move((0, 0))]
+    for before, segment in zip([None, *segments], segments):
+        if isinstance(segment, (CubicBezier, QuadraticBezier)) and segment.smooth:
+            _go_on(segment, before)
         if isinstance(segment, (Move, Close)):
-            if len(points) > 1:
-                lines.append((np.array(points), isinstance(segment, Close)))
-            points = points[:1] if isinstance(segment, Close) else [tuple(segment.end)]
+            is_closed = isinstance(segment, Close)
+            if len(points) > 1 or is_closed and isinstance(before, Move):
+                lines.append((np.array(points), is_closed))
+            points = points[:1] if is_closed else [tuple(segment.end)]
         elif isinstance(segment, Line):
             points.append(tuple(segment.end))
         else:
