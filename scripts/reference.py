@@ -29,7 +29,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from megastep.agents import package
-from megastep.agents.cli import blocks
+from megastep.agents.cli import compose
 from megastep.agents.errors import EXIT_CODES
 from megastep.agents.factory import check, components, settings
 from megastep.imports import import_object
@@ -150,8 +150,8 @@ def _merged(file, device):
     group, _, member = file.removesuffix(".yaml").rpartition("/")
     text = (package.CONFIGS / file).read_text()
     tree = OmegaConf.to_container(OmegaConf.create(text))
-    applied = blocks.blocks_of(device, member if group == "learner" else "ppo")
-    content = blocks.merged(tree, applied)
+    applied = compose.blocks_of(device, member if group == "learner" else "ppo")
+    content = compose.merged(tree, applied)
     defaults = content.pop("defaults", []) if group else []
     bases = [one for one in defaults if isinstance(one, str)]
     if group and "@package _global_" not in text:

@@ -20,7 +20,7 @@ from hydra.core.utils import JobRuntime
 
 from megastep import cache
 from megastep.agents import package
-from megastep.agents.cli import blocks
+from megastep.agents.cli import compose
 from megastep.agents.launch import run as launch_run
 from megastep.agents.runs import provenance
 
@@ -113,7 +113,7 @@ def composed_once():
         paths = [entry.path for entry in loader.get_search_path().get_path()]
         folders = [path for path in paths if not path.startswith(("pkg://", "structured://"))]
         name = JobRuntime.instance().get("name")
-        key = str((method, name, arguments, options, blocks.BlockSource.blocks))
+        key = str((method, name, arguments, options, compose.BlockSource.blocks))
         is_ours = folders == [f"blocks://{package.CONFIGS}"]
         if not is_ours:
             return method(loader, *arguments, **options)

@@ -6,24 +6,30 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from types import NoneType
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import hydra
 import yaml
-from hydra.core import config_store, global_hydra
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core import config_store, global_hydra, plugins
 from hydra.core.override_parser import types
 from hydra.errors import HydraException, MissingConfigException
-from omegaconf import DictConfig, OmegaConf
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import Container, DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from megastep.agents import package
-from megastep.agents.cli import blocks
 from megastep.agents.cli.words import Typed, key_of, parse, typed_of, typed_word
 from megastep.agents.errors import ConfigErrors, UserError, shortened
 from megastep.agents.factory import check, components, conflicts
+from megastep.agents.launch import gpu
+from megastep.imports import import_object, import_path
 from megastep.settings import closest
 
 if TYPE_CHECKING:
+    from hydra.plugins.config_source import ConfigResult
+
     from megastep.agents.cli.command import Command
 
 #: Members of Hydra's own groups that come with the optional dependencies.
@@ -46,10 +52,98 @@ STORE = config_store.ConfigStore.instance()
 STORE.store(name="open", node=OmegaConf.create(OPEN))
 
 
+# ---- Blocks of files, such as `cpu:`: what differs by the device and by the learner ----
+
+
+class BlockSource(FileConfigSource):
+    """Hydra's source of files, which merges the blocks that apply into each; a later file wins."""
+
+    #: The names of blocks, the last of which wins, and whether they apply.
+    blocks: ClassVar[dict[str, bool]] = {}
+
+    @staticmethod
+    def scheme() -> str:
+        return "blocks"
+
+    def load_config(self, config_path: str) -> "ConfigResult":
+        result = super().load_config(config_path)
+        if OmegaConf.is_dict(result.config) and any(name in result.config for name in self.blocks):
+            result.config = OmegaConf.create(merged(plain(result.config), self.blocks))
+        return result
+
+
+class Folders(SearchPathPlugin):
+    """Has Hydra read the files of our folder, and of --config-dir, with their blocks."""
+
+    beside = ""
+
+    def manipulate_search_path(self, search_path) -> None:
+        for entry in search_path.get_path():
+            if entry.path.removeprefix("file://") == str(package.CONFIGS):
+                entry.path = f"blocks://{package.CONFIGS}"
+                if self.beside:
+                    search_path.append("command-line", f"blocks://{self.beside}")
+                break
+
+
+plugins.Plugins.instance().register(BlockSource)
+plugins.Plugins.instance().register(Folders)
+
+
+def blocks_of(device: object, learner: object) -> dict[str, bool]:
+    """Returns the names of blocks, and whether they apply on a device and with a learner."""
+    is_cpu = device == "cpu" or (device == "auto" and not gpu.is_available())
+    own = built_in(str(learner))
+    learners = {name: name == own for name in components.members("learner")}
+    return {"cpu": is_cpu, "gpu": not is_cpu, **learners}
+
+
+def built_in(learner: str) -> str | None:
+    """Returns the name of the built-in learner whose blocks a learner has; None if it has none."""
+    names = {path: name for name, path in components.members("learner").items()}
+    if learner in names.values():
+        return learner
+    paths = [learner]
+    if ":" in learner and learner not in names:
+        with suppress(ValueError):  # which is an error when the settings are checked
+            paths = [*map(import_path, getattr(import_object(learner), "__mro__", ()))]
+    return next((names[path] for path in paths if path in names), None)
+
+
+def merged(tree: check.Tree, blocks: Mapping[str, bool]) -> check.Tree:
+    """Returns what a file holds with its blocks merged into it."""
+    own = [name for name in blocks if isinstance(tree.get(name, False), (dict, NoneType))]
+    content = {key: value for key, value in tree.items() if key not in own}
+    layers = [merged(tree[name] or {}, blocks) for name in own if blocks[name]]
+    return plain(cast(Container, OmegaConf.merge(content, *layers)))
+
+
+def plain(config: Container, resolve: bool = False) -> check.Tree:
+    """Returns a configuration as nested dicts."""
+    return cast(check.Tree, OmegaConf.to_container(config, resolve=resolve))
+
+
+def leave_out_others(config: DictConfig, learner: str | None) -> None:
+    """Takes what only built-in learners have from the settings of a user's learner."""
+    name = learner or OmegaConf.select(config, "learner.name")
+    known = components.members("learner").values()
+    if not isinstance(name, str) or name in known:
+        return
+    with suppress(ValueError):  # it cannot be used, which is an error when settings are checked
+        own = components.kind_of("learner", name).__pydantic_fields__
+        kinds = [components.kind_of("learner", path) for path in known]
+        ours = {key for kind in kinds for key in kind.__pydantic_fields__}
+        for key in ours & {*config.learner} - {*own}:
+            del config.learner[key]
+
+
+# ---- Words ----
+
+
 def own(config: DictConfig, resolve: bool = False) -> check.Tree:
     """Nested dicts of all but Hydra's part, without empty groups."""
     keys = [str(key) for key in config if key != "hydra"]
-    tree = blocks.plain(OmegaConf.masked_copy(config, keys), resolve)
+    tree = plain(OmegaConf.masked_copy(config, keys), resolve)
     return {key: value for key, value in tree.items() if value != {}}
 
 
@@ -78,7 +172,7 @@ class Composer:
                 if not os.path.exists(package.CONFIGS / group / f"{member}.yaml"):
                     store_member(group, member, path)
         STORE.store(group="logger", name="none", node={})
-        blocks.Folders.beside = os.path.abspath(folder) if folder else ""
+        Folders.beside = os.path.abspath(folder) if folder else ""
         global_hydra.GlobalHydra.instance().clear()
         hydra.initialize_config_dir(MAIN, job_name=command.name, version_base="1.3")
         self.loader = global_hydra.GlobalHydra.instance().config_loader()
@@ -193,7 +287,7 @@ class Composer:
                 str(keys[key].value) if key in keys else None for key in ("device", "learner.name")
             )
             config = copy.deepcopy(self.composed(*groups, device=device, learner=learner))
-            blocks.leave_out_others(config, learner)
+            leave_out_others(config, learner)
         except FILE_ERRORS as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
@@ -208,7 +302,7 @@ class Composer:
                     force = one.is_added or not key.startswith("hydra.")
                     OmegaConf.update(config, key, one.value, force_add=force)
             except (ConfigKeyError, ConfigAttributeError, TypeError):  # TypeError: below a value
-                known = dict(check.leaves({"hydra": blocks.plain(config.hydra)}))
+                known = dict(check.leaves({"hydra": plain(config.hydra)}))
                 errors.append((key, f"no such key; {check.closest_key(key, known)}"))
             except OmegaConfBaseException as error:
                 errors.append((key, str(error).partition("\n")[0]))
@@ -219,13 +313,13 @@ class Composer:
     ) -> DictConfig:
         """Returns the configuration of files, with the blocks of the device and learner in them."""
         typed = dict(word.lstrip("+").split("=", 1) for word in groups if "=" in word)
-        applied = blocks.blocks_of(device or "auto", learner or typed.get("learner", GUESS))
+        applied = blocks_of(device or "auto", learner or typed.get("learner", GUESS))
         while True:
-            blocks.BlockSource.blocks = applied
+            BlockSource.blocks = applied
             config = hydra.compose(self.name, [*groups], return_hydra_config=True)
             chosen = OmegaConf.select(config, "learner.name")
-            applied = blocks.blocks_of(device or config.get("device") or "auto", learner or chosen)
-            if applied == blocks.BlockSource.blocks:
+            applied = blocks_of(device or config.get("device") or "auto", learner or chosen)
+            if applied == BlockSource.blocks:
                 OmegaConf.set_struct(config, False)
                 return config
             learner = learner or chosen  # which a block may not choose
@@ -237,7 +331,7 @@ def store_member(group: str, member: str, path: str) -> None:
     if group == "logger":
         node = {components.label(path): node}
     elif group == "learner":  # it has the file of the one that it derives from
-        base = blocks.built_in(path) if member == path else None
+        base = built_in(path) if member == path else None
         node["defaults"] = [*filter(None, [base]), "_self_"]
     STORE.store(group=group, name=member, node=node)
 

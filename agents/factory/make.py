@@ -110,8 +110,8 @@ def played_in(
     cfg: Played, loaded: checkpoint.Checkpoint | None = None
 ) -> tuple[Env, Geometry, list[dict]]:
     """Returns environment, geometry and homes: those of `cfg`, else those of a training."""
-    trained = loaded and config_of(loaded)
-    env = cfg.env or (trained and trained.env)
+    trained: Any = loaded and config_of(loaded)
+    env: Any = cfg.env or (trained and trained.env)
     if cfg.geometry is not None and not components.takes_geometries(env.name):
         raise UserError(
             f"{env_name(env)} takes no floor plans, so it cannot be played in "

@@ -253,21 +253,18 @@ class Played(Common):
     member: PopulationMember = None
 
 
-def _given(run: T | None) -> T:
-    if run is None:
-        raise ValueError("is missing; run=latest takes the newest run, run=FOLDER another one")
-    return run
+def _needed(cure: str) -> BeforeValidator:
+    def given(value: T | None) -> T:
+        if value is None:
+            raise ValueError(f"is missing; {cure}")
+        return value
 
-
-def _folder(folder: T | None) -> T:
-    if folder is None:
-        raise ValueError("is missing; folder=FOLDER is a new folder for the dataset")
-    return folder
+    return BeforeValidator(given)
 
 
 @frozen
 class Evaluate(Played):
-    run: Annotated[str, BeforeValidator(_given)]
+    run: Annotated[str, _needed("run=latest takes the newest run, run=FOLDER another one")]
     episodes: Count
     max_steps: Count | None = None  # None: the environment's own limit
     baseline: Annotated[tuple[str, ...], BeforeValidator(_players)]
@@ -282,7 +279,7 @@ class Dump(Played):
     episodes: Annotated[int, Field(ge=1, le=10_000_000)]
     max_steps: Steps | None = None  # None: the environment's own limit
     format: Literal["npz", "minari", "lerobot"] = "npz"
-    folder: Annotated[str, BeforeValidator(_folder)]
+    folder: Annotated[str, _needed("folder=FOLDER is a new folder for the dataset")]
     truth: bool = False
 
     def conflicts(self) -> Iterator[tuple[str, str]]:

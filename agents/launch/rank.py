@@ -58,7 +58,10 @@ def joined() -> "Iterator[Team | None]":
     except (Exception, signals.Interrupted) as error:
         is_signal = isinstance(error, signals.Interrupted)
         with signals.handled(lambda number: None):  # ignores torchrun's SIGTERM
-            if loss := _cause(error, process_group.RankLost):
+            loss: BaseException | None = error
+            while loss is not None and not isinstance(loss, process_group.RankLost):
+                loss = loss.__context__
+            if loss is not None:
                 team.end_lost(loss)
             reports = info.rank == 0 and team.claim()
             team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
@@ -72,13 +75,6 @@ def joined() -> "Iterator[Team | None]":
     team.leave()
     if has_joined:
         process_group.stop()
-
-
-def _cause(error, kind) -> BaseException | None:
-    """Returns the error of a kind in the chain of an error's contexts; None if there is none."""
-    while error is not None and not isinstance(error, kind):
-        error = error.__context__
-    return error
 
 
 def together(function: Callable[[], T]) -> T:

@@ -127,7 +127,12 @@ class Team:
             problem = within(None if self.is_ours else SILENT_SECONDS, self._poll, SILENCE)
             if problem == SILENCE:
                 if not self.is_ours and not self._wakes.wait(CALL_SECONDS):
-                    self._end_in_silence()
+                    problem = (
+                        f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, "
+                        "does not answer: torchrun has ended there, or that machine or the network "
+                        "is down"
+                    )  # which one rank of this machine reports, as others may be out of reach
+                    self.end(problem if self.is_first_here else None)
                 return  # `launcher` ends its ranks itself
             if problem and not self.has_left:
                 if not self.claim():
@@ -160,14 +165,6 @@ class Team:
         return None
 
     # ---- The end of all ranks ----
-
-    def _end_in_silence(self) -> NoReturn:
-        """Ends this rank. One of this machine reports it, as the others may be out of reach."""
-        problem = (
-            f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, does not "
-            "answer: torchrun has ended there, or that machine or the network is down"
-        )
-        self.end(problem if self.is_first_here else None)
 
     def end(self, problem: str | None) -> NoReturn:
         """Exits at once, because a rank was lost; reports it unless another rank does."""

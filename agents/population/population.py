@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
-from torch.utils._pytree import tree_map
+from torch.utils._pytree import tree_map_only
 
 from megastep import global_generators
 from megastep.agents.algorithms.nonfinite import NonFiniteError
@@ -307,7 +307,7 @@ class Population:
             return learnt
         if learnt is not None:
             parts = learnt.policy.state_dict(), learnt.learner.state_dict(), learnt.wrappers
-            state = tree_map(_on_host, parts)
+            state = tree_map_only(torch.Tensor, lambda x: x.detach().to("cpu", copy=True), parts)
         state = from_rank(source % self.n_ranks, state)
         if target not in self.members:
             return None
@@ -340,8 +340,3 @@ class Population:
         """Closes the members' environments and files."""
         for trainer in self.trainers:
             trainer.close()
-
-
-def _on_host(leaf: object) -> object:
-    """Returns a copy of a tensor on the CPU, and anything else as it is."""
-    return leaf.detach().to("cpu", copy=True) if isinstance(leaf, torch.Tensor) else leaf

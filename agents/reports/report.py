@@ -9,16 +9,20 @@ import itertools
 import json
 import math
 import os
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from megastep.agents import console
-from megastep.agents.errors import user_errors
+from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.evaluation import tables
-from megastep.agents.reports import homes, runs, seeds
-from megastep.agents.runs import checkpoint, populations
+from megastep.agents.evaluation.statistics import SCORES
+from megastep.agents.factory import check, components
+from megastep.agents.factory import make as factory
+from megastep.agents.reports import runs, seeds
+from megastep.agents.runs import checkpoint, folders, populations, trust
 from megastep.atomic_files import write_atomically
 
 HERE = Path(__file__).parent
@@ -32,6 +36,10 @@ with a bootstrap interval; below, performance profiles: the fraction of seeds wh
 above a threshold (Agarwal et al. 2021)."""
 #: A line of the chart of a population's scores, and what it is of the members' scores.
 SUMMARIES = {"best": np.nanmax, "median": np.nanmedian}
+#: Homes that are drawn: so many of the worst, and of the best.
+N_WORST, N_BEST = 36, 12
+#: What an evaluation of another version, or of a stranger, may raise.
+ODD = ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError
 #: Metrics that say nothing as curves.
 NOT_DRAWN = ("episode/count", "episode/window", "updates")
 
@@ -71,11 +79,11 @@ def _one(run: runs.Run, charts: "Charts", file: Path) -> list[str]:
     parts += [_table([], [[key, str(value)] for key, value in _facts(run).items()], heads=True)]
     tables_of_run = []
     for table in run.evaluations:
-        with contextlib.suppress(*homes.ODD):  # of another version, or a stranger's
+        with contextlib.suppress(*ODD):  # of another version, or a stranger's
             head, rows = tables.grid([*table["rows"], *table.get("differences", ())])
             tables_of_run += [f"<p>{_text(table['title'])}</p>", _table(head, rows)]
     parts += ["<h2>Evaluations</h2>", *tables_of_run] if tables_of_run else []
-    parts += homes.section(run)
+    parts += section(run)
     parts += ["<h2>Curves</h2>", _curves([run], [([run], "")], charts)]
     films = [os.path.relpath(film, file.parent) for film in sorted(run.folder.glob("*.mp4"))]
     shown = [f'<video controls loop muted src="{_text(link)}"></video>' for link in films]
@@ -101,6 +109,78 @@ def _facts(run) -> dict[str, object]:
         facts |= {"command": command, "resumed": times, "last command": last.get("command", "")}
     keys = {word.lstrip("-+").partition("=")[0] for word in command.split() if "=" in word}
     return facts | {key: value for key, value in runs.leaves(run.config) if key in keys}
+
+
+# ---- Its homes, drawn from above and coloured by what was earned in them ----
+
+
+def section(run: runs.Run) -> list[str]:
+    """Returns the HTML that shows where the agent does badly; empty without several homes."""
+    for table in run.evaluations:
+        if "home" not in table.get("episodes", {}):
+            continue
+        try:
+            name, by_home = score_by_home(table["episodes"])
+            plans = plans_of(run, table)
+        except (UserError, ConfigErrors, *ODD) as error:
+            return [f"<p>Homes are not drawn: {html.escape(str(error))}</p>"]
+        worst = sorted(by_home, key=by_home.__getitem__)
+        if len(worst) < 2 or not all(0 <= home < len(plans) for home in worst):
+            continue
+        span = by_home[worst[0]], by_home[worst[-1]]
+        drawn = worst[:N_WORST] + worst[max(N_WORST, len(worst) - N_BEST) :]
+        n_left = len(worst) - len(drawn)
+        text = (
+            f"{table['title']}. By {name}, worst first: {span[0]:.3g} to {span[1]:.3g} in "
+            f"{len(worst):,} homes{f'; {n_left:,} between them are not drawn' * (n_left > 0)}."
+        )
+        shown = [figure(home, plans[home], by_home[home], span) for home in drawn]
+        return [
+            "<h2>Homes, worst first</h2>",
+            f"<p>{html.escape(text)} <code>record.py home=N</code> films one of this split.</p>",
+            f'<div class="plans">{"".join(shown)}</div>',
+        ]
+    return []
+
+
+def score_by_home(episodes: Mapping[str, Sequence]) -> tuple[str, dict[int, float]]:
+    """Returns the first of `SCORES` that episodes have, and its mean by home, of one agent."""
+    name = next(name for name in SCORES if any(v is not None for v in episodes.get(name, ())))
+    agents, values = episodes["agent"], defaultdict(list)
+    for agent, home, value in zip(agents, episodes["home"], episodes[name], strict=True):
+        if agent == agents[0] and home is not None and value is not None:
+            values[int(home)].append(float(value))
+    return name, {home: float(np.mean(some)) for home, some in values.items()}
+
+
+def plans_of(run: runs.Run, table: Mapping) -> list:
+    """Returns the geometries of the split that a table is about."""
+    loaded = folders.load_checkpoint(folders.find(str(run.folder)), False, "cpu")
+    trained = factory.config_of(loaded)
+    chosen, geometry = table["evaluation"], trained.geometry
+    if typed := chosen.get("geometry"):
+        trust.check({"train": {"geometry": typed}}, "An evaluation", "")
+        geometry = check.check(components.kind_of("geometry", str(typed["name"])), typed)
+    return factory.homes(trained.env, geometry, str(chosen["split"]))
+
+
+def figure(number: int, plan: Mapping, value: float, span: tuple[float, float]) -> str:
+    """Returns a home from above, its floor coloured by a value between the bounds of `span`."""
+    walls = np.asarray(plan["walls"], float)
+    low, high = walls.min((0, 1)), walls.max((0, 1))
+    lines = "".join(
+        f"M{a[0] - low[0]:.2f} {high[1] - a[1]:.2f}L{b[0] - low[0]:.2f} {high[1] - b[1]:.2f}"
+        for a, b in walls
+    )
+    width, height = high - low
+    fraction = (value - span[0]) / (span[1] - span[0]) if span[1] > span[0] else 1.0
+    # from a dark red to a light green: lightness differs as well
+    hue, saturation, lightness = 10 + 110 * fraction, 70 - 15 * fraction, 48 + 20 * fraction
+    colour = f"hsl({hue:.0f} {saturation:.0f}% {lightness:.0f}%)"
+    box = f"-.3 -.3 {width + 0.6:.2f} {height + 0.6:.2f}"
+    floor = f'<rect width="{width:.2f}" height="{height:.2f}" fill="{colour}"/>'
+    drawing = f'<svg viewBox="{box}" role="img">{floor}<path d="{lines}"/></svg>'
+    return f"<figure>{drawing}<figcaption>{number}: {value:.3g}</figcaption></figure>"
 
 
 # ---- Several runs ----

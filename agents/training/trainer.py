@@ -10,11 +10,10 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.ranks import Plan, Ranks, world
 from megastep.agents.runs.saver import NOWHERE, Saver
 from megastep.agents.training.budget import Budget, Stopwatch
-from megastep.agents.training.callbacks import Callbacks, Losses, NonFiniteGuard
+from megastep.agents.training.callbacks import Callbacks, Losses, NonFiniteGuard, Tuning
 from megastep.agents.training.episode_stats import Episodes
 from megastep.agents.training.performance import Timing
 from megastep.agents.training.run_state import RunState
-from megastep.agents.training.tuning import Tuning
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
 

@@ -19,12 +19,13 @@ from megastep.hosting.probe import (
     TRUE_RETURN,
     Probe,
     RewardRecorder,
+    allowed_actions,
     freeze,
     load_wrapper_state,
+    masked_actions,
     numbers_of,
     wrapper_state,
 )
-from megastep.hosting.values import allowed_actions, masked_actions
 from megastep.types import Space, Tree
 
 __all__ = ["HostedEnvs", "ParallelEnvs", "make_env"]

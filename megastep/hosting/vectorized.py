@@ -55,7 +55,7 @@ class VectorizedEnv:
         device: torch.device | str | None,
         check: bool = True,
     ):
-        from megastep.hosting.values import CHECKED_STEPS
+        from megastep.hosting.probe import CHECKED_STEPS
 
         self.id, self.vector, self.n_envs, self.n_agents = id, vector, n_envs, n_agents
         self.device = engine.device("auto" if device is None else device)
@@ -156,7 +156,7 @@ class VectorizedEnv:
 
     def _check_observations(self, obs) -> None:
         """Raises BadValue for those outside their space, and warns once of those beyond a Box."""
-        from megastep.hosting.values import beyond_bounds
+        from megastep.hosting.probe import beyond_bounds
 
         self._n_to_check -= 1
         for problem, is_box in beyond_bounds(self.vector.single_observation_space, obs):

@@ -4,7 +4,7 @@ import textwrap
 
 import pytest
 
-from megastep.agents.cli import blocks, evaluate, train
+from megastep.agents.cli import compose, evaluate, train
 from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
 from megastep.agents.errors import ConfigErrors
@@ -155,7 +155,7 @@ def test_a_class_has_the_blocks_of_the_learner_it_derives_from(own):
     cfg = tiny.settings(f"learner={own}:MyPPO", "experiment=pong", "device=cuda").learner
     assert (cfg.lr, cfg.gamma, cfg.n_epochs) == (1e-3, 0.99, 2)
     assert tiny.settings(f"learner.name={own}:MyPPO").learner.lr == 3e-3
-    assert [blocks.built_in(f"{own}:{name}") for name in ("MyR2D2", "A2C", "No")] == [
+    assert [compose.built_in(f"{own}:{name}") for name in ("MyR2D2", "A2C", "No")] == [
         *("r2d2", None, None)
     ]
 

@@ -15,8 +15,7 @@ from gymnasium import spaces  # noqa: E402
 from megastep.envs import Gymnasium  # noqa: E402
 from megastep.hosting.env_error import BadValue, EnvError  # noqa: E402
 from megastep.hosting.hosted import HostedEnvs  # noqa: E402
-from megastep.hosting.probe import probe  # noqa: E402
-from megastep.hosting.values import beyond_bounds  # noqa: E402
+from megastep.hosting.probe import beyond_bounds, probe  # noqa: E402
 from tests.helpers import odd_envs  # noqa: E402
 
 

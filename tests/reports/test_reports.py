@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from megastep.agents.cli import compare, evaluate, report, train
-from megastep.agents.reports import homes, runs
+from megastep.agents.reports import report as page_of
+from megastep.agents.reports import runs
 from megastep.agents.reports.compare import write as write_plot
 from megastep.agents.runs import json_lines
 from tests.helpers import tiny
@@ -86,7 +87,7 @@ def test_report_of_a_run(here, capsys):
     table = json.loads(table.read_text())
     returns = [row[1] for row in page.rows if row and row[0] in ("trained", "random")]
     assert returns == [f"{row['return']:.2f}" for row in table["rows"]]
-    _, by_home = homes.score_by_home(table["episodes"])
+    _, by_home = page_of.score_by_home(table["episodes"])
     shown = [int(caption.partition(":")[0]) for caption in page.captions]
     assert shown == sorted(by_home, key=by_home.__getitem__) and len(shown) == 4
     titles = [chart["title"] for chart in page.charts]
