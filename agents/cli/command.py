@@ -19,25 +19,17 @@ from megastep.settings import settings_of
 
 @dataclasses.dataclass
 class Command:
-    """A command of the package. Its module, `agents/cli/NAME.py`, has it as `COMMAND`.
+    """A command of the package. Its module, `agents/cli/NAME.py`, has it as `COMMAND`."""
 
-    Attributes:
-        name: of the command, its module, and the file of its configuration.
-        run: the function that it calls. Its arguments are the settings, unless `kind` is given.
-        help: the head of --help.
-        kind: the dataclass of the settings that `run` takes, if files in configs/ have them.
-        prepare: changes the composed tree before it is checked, given the typed keys.
-        ready: raises UserError for checked settings that cannot be run here.
-        has_ranks: torchrun may start it.
-    """
-
-    name: str
-    run: Callable
-    help: str
-    kind: Any = None
+    name: str  # of the command, its module, and the file of its configuration
+    run: Callable  # its arguments are the settings, unless `kind` is given
+    help: str  # the head of --help
+    kind: Any = None  # the dataclass of the settings that `run` takes, if configs/ has them
+    #: Changes the composed tree before it is checked, given the typed keys.
     prepare: Callable[[check.Tree, list[str]], check.Tree] = lambda tree, typed: tree
+    #: Raises UserError for checked settings that cannot be run here.
     ready: Callable[[Any], None] = lambda cfg: None
-    has_ranks: bool = False
+    has_ranks: bool = False  # torchrun may start it
 
     def __post_init__(self) -> None:
         self.has_files = self.kind is not None

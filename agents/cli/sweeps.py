@@ -61,10 +61,7 @@ OmegaConf.register_new_resolver("file_name", _file_name, replace=True)
 
 
 def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list, Any]:
-    """Returns (the words of each job that is known beforehand; their checked settings; Hydra's
-    configuration). Of a grid these are all jobs; of a search, the first of all values, and each
-    other value and bound alone.
-    """
+    """Returns (words of known jobs, their settings, Hydra's configuration); of a search, bounds."""
     values = {key_of(override): _values(override) for override in composer.parse(words)}
     config = composer.compose([options[0] for options in values.values() if options[0]])[1].hydra
     params = composer.parse(f"{k}={v}" for k, v in (config.sweeper.get("params") or {}).items())

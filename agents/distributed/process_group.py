@@ -43,9 +43,7 @@ class RankLost(RuntimeError):
 
 
 def start() -> None:
-    """Joins the ranks that torchrun started, unless this process has joined already. Raises
-    RuntimeError or ValueError if they cannot connect.
-    """
+    """Joins the ranks that torchrun started. RuntimeError or ValueError if they cannot connect."""
     info = rank_info()
     if info is None or distributed.is_initialized():
         return
@@ -57,9 +55,7 @@ def start() -> None:
 
 
 def stop() -> None:
-    """Leaves the process group. If that takes longer than `STOP_SECONDS`, the process ends with
-    exit code 1, whatever blocks it: there is nothing left to save.
-    """
+    """Leaves the process group, after `STOP_SECONDS` by ending this process."""
     if distributed.is_initialized():
         with open(os.devnull, "w") as nowhere:
             faulthandler.dump_traceback_later(STOP_SECONDS, file=nowhere, exit=True)

@@ -236,9 +236,7 @@ class Waves:
         self.actor.draws.on(device).manual_seed(stream_seed(seed, "actions"))
 
     def play(self, wave: int) -> tuple[dict[str, torch.Tensor], np.ndarray, np.ndarray | None]:
-        """Plays a wave. Returns its arrays (B, T + 1, ...) on the CPU as they are stored, with rows
-        after an episode's end; how many steps each episode has, (B,); and its layout, (B,).
-        """
+        """Plays a wave. Returns its arrays (B, T + 1, ...), lengths (B,) and layouts (B,)."""
         self._begin(wave)
         assert self.told is not None
         layout = optional(self.told.env, "layout")

@@ -150,9 +150,7 @@ class EvalEnv:
         ]
 
     def begin(self, run: checkpoint.Checkpoint, *players: Player) -> list[PolicyLike]:
-        """Returns the policies of players in the environment, as it was when it was made, whose
-        wrappers know what the first player's run had learnt, of a bot what `run` had.
-        """
+        """Returns players' policies in the environment, set back, with the first's wrappers."""
         policies = [player.policy for player in players]
         if not self._is_used:
             self._go_back = way_back(self.env) if optional(self.env, "resumable") else None
@@ -224,13 +222,9 @@ def is_bot(name: str) -> bool:
 def find_player(
     name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Env, trust: bool
 ) -> Player:
-    """Returns who is to meet the agent of `run` in `env`, or to be compared with it there. Raises
-    UserError if this player cannot play there.
-
-    Args:
-        name: a run's folder or checkpoint, or a pretrained agent; or what needs no weights: an
-            import path, one of `BOTS`, or `bot`, the environment's own.
-        trust: import what a run that another user made names.
+    """Returns who is to meet the agent of `run` in `env`, or to be compared with it there: a run's
+    folder or checkpoint, a pretrained agent, an import path, one of `BOTS`, or `bot`, the
+    environment's own. UserError if this player cannot play there.
     """
     if is_bot(name):
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))

@@ -17,15 +17,9 @@ ORACLE = "oracle"  # the bot that knows where everything is
 
 
 def run(cfg: settings.Evaluate) -> Path:
-    """Evaluates a run, each environment in one home throughout. Returns the path of the table.
-
-    With several ranks, each plays some of the environments. Rank 0 writes; the others return the
-    run's folder.
-
-    Writes .json, .md and .csv, which has a row per episode, into the run's folder `evaluations`,
-    one of each per source of geometries (per environment where it has none), split and checkpoint.
-    Of `geometry=suite` plays as many episodes in each source. With `cfg.against` plays duels; with
-    `cfg.ratings` writes ratings.csv.
+    """Evaluates a run, each environment in one home throughout. Returns the path of the table: of
+    .json, .md and .csv files in the run's folder `evaluations`. With several ranks, each plays some
+    of the environments, and rank 0 writes.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device)
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
@@ -94,10 +88,8 @@ def _play(
 ) -> tuple[list[Row], list[Row], list[Row]]:
     """Plays `cfg.episodes` with the run's agent and each of `cfg.baseline`, all from the same
     places with the same draws, in homes of a `source` or of several, which have `numbers`. Returns
-    the rows of the table, those of the agent less each other, and those of the episodes.
-
-    If the bot `oracle` is among them, all have a further metric, `oracle_fraction`: what they found
-    divided by what the oracle found in the same episode.
+    the rows of the table, those of the agent less each other, and those of the episodes. With the
+    bot `oracle`, `oracle_fraction` is what each found divided by what that one found.
     """
     policy = restore.policy_of(loaded, where.env)
     players = [Player("trained, greedy" if cfg.greedy else "trained", policy, loaded)]

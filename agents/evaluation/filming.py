@@ -16,10 +16,7 @@ from megastep.types import PolicyLike
 
 
 def run(cfg: settings.Record) -> Path:
-    """Films agents of runs, or random actions. Returns the path of the video: `cfg.file`, or the
-    first free name of `video.mp4`, `video-2.mp4`, ... Raises UserError: it cannot be made. No file
-    is left.
-    """
+    """Films agents, or random actions. Returns the path of the video. UserError, and no file."""
     folder, device = Path(), factory.make_device(cfg.device)
     names = (cfg.run,) if cfg.run is not None else cfg.runs or ()
     runs = [folders.load_checkpoint(folders.find(name), cfg.trust, device) for name in names]

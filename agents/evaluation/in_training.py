@@ -87,9 +87,7 @@ class Evaluations:
             trainer.end()
 
     def measure(self, policy: Policy) -> dict[str, float]:
-        """Returns the means of `return`, `length` and each metric of the environment, over the
-        finished episodes of the lanes that learn, or of all if none does; NaN without one.
-        """
+        """Returns means over the finished episodes of lanes that learn, or of all; or NaN."""
         env = self.where.env
         with global_generators.kept(), torch.random.fork_rng(self.gpus):
             if self.go_back is not None:

@@ -36,13 +36,8 @@ def step_until(
 ) -> None:
     """Calls `world, state = step(world, state)` until all of `is_over` is true, or `max_steps`
     times. On a GPU, in CUDA graphs after the first `CHECK_EVERY` steps, where libraries initialise
-    themselves, if `can_capture`; with a warning, if they cannot be recorded after all.
-
-    Args:
-        is_over: bool of any shape, which `step` changes in place.
-        step: acts by `policies`, steps `env`, and changes only what is below them and `roots`, see
-            `megastep.capture.capture`.
-        world, state: the current world, and the hidden state before the first step.
+    themselves, if `can_capture`. `step` acts by `policies`, steps `env`, and changes only what is
+    below them, `is_over` and `roots`, see `megastep.capture.capture`.
     """
 
     def several(world, state, n_steps=STEPS_PER_GRAPH) -> tuple[World, Tree]:
@@ -70,9 +65,7 @@ def step_until(
 
 
 def can_capture(env: Env, policies: Sequence[PolicyLike]) -> bool:
-    """Returns whether steps of these may be replayed as a CUDA graph: all are `capturable`, by
-    default policies of megastep's classes, since others may keep a state where no graph sees it.
-    """
+    """Returns whether steps may be replayed as a CUDA graph: all of them are `capturable`."""
     return optional(env, "capturable") and all(
         getattr(policy, "capturable", type(policy).__module__.startswith("megastep."))
         for policy in policies

@@ -26,14 +26,8 @@ N_ORDERS = 10
 #: Scores of player i in duels with player j, by (i, j): 1 won, 0 lost, 0.5 a draw.
 Scores = Mapping[tuple[int, int], Sequence[float]]
 
-#: Columns of the table, as templates.
-COLUMNS = {
-    "player": "{player}",
-    "rating": "{rating:.2f}",
-    "sigma": "{sigma:.2f}",
-    "won": "{won:.3f}",
-    "duels": "{duels}",
-}
+#: Columns of the table, and the forms of their numbers.
+COLUMNS = dict(player="", rating=".2f", sigma=".2f", won=".3f", duels="")
 
 
 def write(
@@ -75,7 +69,7 @@ def write(
     n_homes = None if layouts is None else len(layouts.unique())
     title = tables.title_of(where, geometry, cfg.split, what, n_homes)
     title = f"Ratings in {title}, seed {cfg.seed}"
-    cells = [[form.format_map(row) for form in COLUMNS.values()] for row in table]
+    cells = [[format(row[name], form) for name, form in COLUMNS.items()] for row in table]
     console.say(f"{title}\n{console.table([*COLUMNS], cells)}")
     with user_errors(f"{folder} cannot be written: "):
         folder.mkdir(parents=True, exist_ok=True)

@@ -48,13 +48,8 @@ def write_table(
     differences: list,
     episodes: Sequence[Mapping],
 ) -> Path:
-    """Prints a table, and writes it into the run's folder `evaluations`: as .md, for people, and
-    as .json, for programs. Returns the latter's path.
-
-    Args:
-        names: parts of the files' name.
-        differences: rows of the agent less others, which end the table.
-        episodes: a row per episode, for the .csv and, by column, the .json.
+    """Prints a table, ended by `differences`, and writes it into the run's folder `evaluations`: as
+    .md, as .csv of `episodes`, and as .json, whose path it returns.
     """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
     path = folder_of(loaded.path) / "evaluations" / f"{for_file('-'.join(names))[:200]}.json"

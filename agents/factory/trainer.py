@@ -48,11 +48,9 @@ def make_trainer(
 
     Args:
         token: a name that all ranks of this start have, and no other start.
-        ranks: those that train the policy; None: all that there are.
         callbacks: of rank 0, before those of `cfg`.
         make_evaluations: (cfg, env, device, ranks) -> a callback that evaluates in training.
         n_members: trainers of a population that memory is to hold from this one on.
-        homes: the floor plans to train in, if they are made already.
     """
     number, n_ranks = ranks = world() if ranks is None else ranks
     seed = rank_seed(cfg.seed, number)

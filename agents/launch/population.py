@@ -115,10 +115,7 @@ class PopulationRun(Run):
 
     @contextlib.contextmanager
     def around(self) -> Iterator[None]:
-        """Inside, ranks pool nothing, and what there is now is not looked through for garbage, as
-        each recording of a CUDA graph does: of many members, that would take longer than the
-        recording.
-        """
+        """Inside, ranks pool nothing; for recording CUDA graphs, no garbage is looked for."""
         gc.collect()
         gc.freeze()
         try:

@@ -19,10 +19,7 @@ from megastep.types import n_lanes, optional
 
 
 def run(cfg: settings.Train) -> Path | None:
-    """Trains, as one of the ranks if torchrun started this process, or starting `cfg.ranks` of
-    them. Returns the run folder, None for a dry run. Raises Interrupted after a signal, once saved;
-    UserError if training cannot start or continue.
-    """
+    """Trains, with other ranks if there are. Returns the folder, None of a dry run. Interrupted."""
     if cfg.dry_run:
         return dry_run(cfg)
     is_population = cfg.population.size > 1 and cfg.population.member is None

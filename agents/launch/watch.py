@@ -1,9 +1,8 @@
 """Detects ranks that were killed or cut off, in a thread of each rank, and ends the others.
 
 Every rank writes a heartbeat to the ranks' key-value store and reads those of all. The first to
-miss one tells the others through the store. A rank that the store no longer answers ends itself,
-whatever its other threads are blocked in. A rank that hangs but beats is left to PyTorch's own
-time-outs.
+miss one tells the others. A rank that the store no longer answers ends itself. A rank that hangs
+but beats is left to PyTorch's own time-outs.
 """
 
 import contextlib

@@ -61,9 +61,7 @@ def hosted(size: int) -> range:
 
 
 class Streams:
-    """What the members of one process each have for themselves: a stream of the GPU, and the global
-    generators, from which code of the user's may draw.
-    """
+    """What each member of a process has for itself: a GPU's stream, and global generators."""
 
     def __init__(self, n: int, device: torch.device):
         self.device, is_on_gpu = device, device.type == "cuda"
@@ -178,10 +176,7 @@ class Population:
         return self.leader.samples
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Trains all members until the budget is spent, one of them ends, or `stop()` returns True,
-        then saves a checkpoint of each. Raises NonFiniteError if all have diverged, or an
-        environment returns only NaN.
-        """
+        """Trains until the budget is spent or a member ends, then saves. NonFiniteError."""
 
         def ends() -> bool:
             return stop() or any(one.is_stopped for one in self.trainers)

@@ -68,25 +68,15 @@ class DamagedCheckpoint(CheckpointError):
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A loaded checkpoint, or an agent file.
+    """A loaded checkpoint, or an agent file."""
 
-    Attributes:
-        path: its folder, or the file.
-        step: environment steps of all lanes before it was saved.
-        numbers: counters of the state, such as samples and seconds.
-        config: the run's configuration, as saved.
-        made_with: versions, device and threads that the numbers depend on.
-        state: dicts of tensors and numbers, as saved; None if it was not loaded.
-        n_ranks: number of ranks whose state it holds.
-    """
-
-    path: Path
-    step: int
-    numbers: dict[str, float]
+    path: Path  # its folder, or the file
+    step: int  # environment steps of all lanes before it was saved
+    numbers: dict[str, float]  # counters of the state, such as samples and seconds
     config: Config
-    made_with: Row
-    state: StateDict | None = None
-    n_ranks: int = 1
+    made_with: Row  # versions, device and threads that the numbers depend on
+    state: StateDict | None = None  # None if it was not loaded
+    n_ranks: int = 1  # whose state it holds
 
 
 # ---- Writing ----

@@ -26,24 +26,18 @@ RANK_SECONDS = 60.0
 
 
 class Saver:
-    """Writes the checkpoints of a run in a background thread.
-
-    Each rank has one. The others hand in files of their states, which rank 0 moves into the
-    checkpoint. If the disk is full, read-only or faulty, the next call or `wait` warns once; later
-    calls try again.
+    """Writes the checkpoints of a run in a background thread. Each rank has one; rank 0 moves the
+    others' files into the checkpoint. If the disk fails, `wait` warns once, and later calls retry.
 
     Args:
         folder: the run's `checkpoints` folder, which all ranks share. `NOWHERE`: nothing is saved.
-        config: the run's configuration, stored in each checkpoint.
-        keep_checkpoints, made_with: see `checkpoint.save`.
+        config, keep_checkpoints, made_with: see `checkpoint.save`.
         replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is saved once per
             this many checkpoints, and with the last one if it has at most `LAST_REPLAY` bytes.
         launch: name of this start, the same on all ranks. Files of others are deleted.
-        rank, n_ranks: number of this rank, and of all.
 
     Attributes:
-        error: why the last checkpoint could not be written, as a sentence; None if it was
-            written. Valid after `wait`.
+        error: why the last checkpoint could not be written; None if it was. Valid after `wait`.
         lacks_replay: True if the last call left out the replay buffer.
     """
 
@@ -73,10 +67,8 @@ class Saver:
     def __call__(
         self, step: int, state: StateDict, score: float | None = None, is_last: bool = False
     ) -> None:
-        """Copies `state` to the CPU and starts to write a checkpoint of it after so many
-        environment steps of all lanes. `score`: higher is better. `is_last`: no other follows.
-        Raises NonFiniteError if policy or learner have a NaN or infinity; earlier checkpoints are
-        kept.
+        """Copies `state` to the CPU and starts to write a checkpoint of it. `is_last`: no other
+        follows. Raises NonFiniteError if policy or learner have a NaN or infinity.
         """
         if self.folder == NOWHERE:
             return

@@ -32,10 +32,7 @@ def evaluation(file: Path) -> Row:
 
 
 def outcome(result: Path, metric: str = "episode/return") -> dict[str, float | None]:
-    """Returns the scores of a run folder, or of an evaluation's .json, each None if unknown: the
-    `evaluated` metric, such as the return, or the fraction of duels won, with its 95 % interval,
-    `lower` to `upper`; and `score`, a run's `mean`, or the same if the metric is `eval/NAME`.
-    """
+    """Returns `score`, `evaluated`, `lower`, `upper` of a run's folder or an evaluation's .json."""
     files, rows = [result], []
     kind, _, name = metric.partition("/")
     if is_run := result.is_dir():

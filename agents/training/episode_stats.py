@@ -235,9 +235,7 @@ class EpisodeStats:
 
 
 def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """Returns groups of an environment's lanes by name, (B,) bool: one per role, and one per kind
-    of opponent; of the `stored` lanes alone, (all lanes,) bool, such as those that learn.
-    """
+    """Returns groups of (stored) lanes by name, (B,) bool: of each role and kind of opponent."""
     groups, roles = {}, optional(env, "roles") or ()
     for role in dict.fromkeys(roles):
         has_role = torch.tensor([name == role for name in roles], device=env.device)
@@ -273,9 +271,7 @@ class Episodes:
     def begin(
         self, trainer: Trainer, sources: Sequence[str] | None = None, desync: bool = False
     ) -> None:
-        """Begins to count, by the source of each layout. `desync` starts the first episodes at
-        random ages, if the environment can, and leaves them out.
-        """
+        """Begins to count, by the source of each layout; `desync` starts at random ages."""
         env, rollout = trainer.env, trainer.rollout
         allocate_layouts = getattr(trainer.collect, "allocate_layouts", None)
         if optional(env, "layout") is None or not allocate_layouts:

@@ -56,10 +56,7 @@ class RunState:
         return dict(policy=self.trainer.policy.state_dict(), **learnt)
 
     def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> None:
-        """Restores a `state_dict`. `trainer.lost` gets a clause for each part that could not be
-        restored and starts anew. For a rank that the saved run did not have, the state is rank
-        0's, without episodes, and this rank keeps its own generators.
-        """
+        """Restores a `state_dict`; `trainer.lost` gets a clause for each part that starts anew."""
         trainer = self.trainer
         trainer.samples, trainer.updates = state["samples"], state["updates"]
         trainer.clock.seconds_before = state["seconds"]

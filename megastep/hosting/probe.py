@@ -75,10 +75,7 @@ def numbers_of(info: object) -> dict[str, float]:
 
 
 def probe(make: Callable, seed: int = 0) -> Probe:
-    """Makes an environment, plays an episode of at most `MAX_STEPS` and `MAX_SECONDS`, and closes
-    it. Leaves the global generators as they were. An error ends the episode: the same one comes in
-    training, which names it.
-    """
+    """Plays an episode, of `MAX_STEPS` and `MAX_SECONDS` at most, which an error ends."""
     names, total, is_changed, n_masked = [], 0.0, False, 0
     with kept():
         env = make()

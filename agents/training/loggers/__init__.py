@@ -25,9 +25,7 @@ class LoggerError(RuntimeError):
 
 class Loggers:
     """All loggers of one run. Raises LoggerError: the files cannot be written. They are unchanged.
-
-    A file of JSON lines that cannot be written is warned about once, and the next report tries
-    again. Any other logger is dropped with a warning when it cannot be made or fails.
+    Any logger beside the JSON lines is dropped with a warning when it cannot be made or fails.
 
     Args:
         folder: the run folder.
