@@ -210,8 +210,7 @@ def make_opponents(
 
 def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
     """Returns a policy that does not learn, which takes one step in `env`; UserError if it cannot
-    play. `name` is one of `BOTS`, the import path of a class, a run, whose agent it is, or None,
-    the class that is `env.bot`.
+    play. `name`: one of `BOTS`, an import path, a run, whose agent it is, or None: `env.bot`.
     """
     where = type(env).__name__
     if name and name not in BOTS and ":" not in name:

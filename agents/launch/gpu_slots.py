@@ -35,8 +35,7 @@ def check(jobs: Sequence, hydra: Any) -> None:
 @contextlib.contextmanager
 def taken(cfg: settings.Common, number: int) -> Iterator[settings.Common]:
     """Gives a job a slot, by its number in the sweep, for the context. Ranks see only its GPUs; for
-    a job in this process it is PyTorch's current device. Yields the settings, in which device=cuda
-    is replaced by the GPU's number. A job with device=cpu or cuda:1 takes no slot.
+    a job in this process it is PyTorch's current device, and in the settings that are yielded.
     """
     n_gpus = gpu.count() if cfg.device in ("auto", "cuda") else 0
     if n_gpus < 2:

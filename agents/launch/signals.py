@@ -53,9 +53,8 @@ def exit_on_signals(script: str) -> None:
 def handled(
     on_first: Callable[[int], None], on_second: Callable[[int], None] = lambda number: None
 ) -> Iterator[list[int]]:
-    """Handles signals for the context, which gets a list, empty until the first signal's number is
-    in it. A second Ctrl-C or SIGTERM ends the process at once, which is safe: checkpoints are
-    renamed when they are whole. After SIGUSR1 or SIGUSR2 it counts as the first.
+    """Handles signals for the context, which gets a list that the first signal's number joins. A
+    second Ctrl-C or SIGTERM ends the process at once; after SIGUSR1 or SIGUSR2 it is the first.
     """
     numbers, ends_after = [], None
 

@@ -138,8 +138,7 @@ def pretrained() -> dict[str, Path]:
 
 def find(name: str, member: int | str | None = "best") -> Path:
     """Returns the path of a run, a checkpoint or an agent file: an existing path, `latest`, or the
-    name of a pretrained agent; of a population a member's, `best` or a number, or with None its
-    own. Raises UserError with the most similar names if there is none.
+    name of a pretrained agent; of a population a member's, or its own with None. UserError.
     """
     path = Path(name)
     if name == "latest" and (folders := known()):

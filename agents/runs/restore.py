@@ -20,10 +20,8 @@ def policy_of(
     device: torch.device | str = "cpu",
     critic: str | None = None,
 ) -> Policy:
-    """Returns the policy of a checkpoint, whose weights need no gradient, for an environment or on
-    a device; with a kind of `critic`, or to act alone. On a CPU this sets the number of threads
-    that PyTorch uses, as training does. UserError naming what differs, if the weights do not fit
-    the spaces.
+    """Returns the policy of a checkpoint, for an environment or on a device; with a kind of
+    `critic`, or to act alone. On a CPU this sets PyTorch's threads, as training does. UserError.
     """
     device = torch.device(device if env is None else env.device)
     settings = loaded.config["train"]["agent"]

@@ -32,8 +32,7 @@ Conversion = tuple[Space, Callable[[Any], Any]]
 
 def observation(space: Any, path: str = "observation") -> Conversion:
     """Returns the observation space for one of Gymnasium's, and a function from a batch of its
-    values, arrays (N, ...), to arrays of ours, (N, *space.shape) per leaf. Raises ValueError for
-    the first leaf that no encoder takes.
+    values, (N, ...), to ours, (N, *space.shape) per leaf. ValueError: no encoder takes a leaf.
     """
     from gymnasium import spaces as gym
 
@@ -62,9 +61,8 @@ def observation(space: Any, path: str = "observation") -> Conversion:
 
 
 def actions(space: Any, path: str = "action") -> Conversion:
-    """Returns the action space for one of Gymnasium's, and a function from arrays of our actions,
-    (N, *space.shape) per leaf, to a batch of its values, arrays (N, ...). Raises ValueError for the
-    first leaf that no output chooses.
+    """Returns the action space for one of Gymnasium's, and a function from our actions,
+    (N, *space.shape) per leaf, to a batch of its values, (N, ...). ValueError: none chooses a leaf.
     """
     from gymnasium import spaces as gym
 
@@ -113,11 +111,8 @@ def actions(space: Any, path: str = "action") -> Conversion:
 
 
 def _image(space) -> Conversion | None:
-    """Returns the conversion of a Box that is an image or a stack of images, None if it is not.
-
-    What has other axes than rows, columns and a few channels must be uint8 or have the same bounds
-    everywhere, unlike a stack of vectors. A wrapper marks a smaller one, (C, H, W) uint8, by an
-    attribute ``is_image``.
+    """Returns the conversion of a Box that is an image or a stack of images, None if it is not:
+    with the same bounds everywhere, unlike vectors, or marked by a wrapper as ``is_image``.
     """
     if getattr(space, "is_image", False):
         return spaces.MultiImage(1, *space.shape, dtype=torch.uint8), lambda x: x[:, None]

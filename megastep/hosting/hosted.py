@@ -41,10 +41,8 @@ def make_env(spec: Any, wrappers: Sequence[Callable], settings: dict) -> gymnasi
 
 
 class Hosted:
-    """N environments of A agents in this process, B = N A lanes, the `first` of a number in
-    messages. The step after all agents of an environment have ended resets it. Arrays that are
-    returned are valid until the next call. A subclass has `_begin` and `_step`, which fill an
-    environment's rows.
+    """N environments of A agents in this process, B = N A lanes. The step after all agents of one
+    have ended resets it. Arrays are valid until the next call. A subclass has `_begin` and `_step`.
     """
 
     HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
@@ -119,9 +117,7 @@ class Hosted:
                 freeze(env)
 
     def start_rendering(self) -> str | None:
-        """Sets the render mode to rgb_array, if there is that and no other was chosen, and returns
-        it. Not before the first frame: LunarLander then steps at a third of the speed.
-        """
+        """Sets and returns the render mode, at the first frame: it slows LunarLander's steps."""
         if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
             os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame complains of no display
         if self.render_mode is None and "rgb_array" in self.metadata.get("render_modes", ()):

@@ -25,18 +25,13 @@ PARTS = "mean", "var", "count"
 
 
 class Probe(NamedTuple):
-    """What an episode has shown.
+    """What an episode has shown."""
 
-    Attributes:
-        names: keys of the numbers in its last ``info``, `is_success` first; before them
-            `TRUE_RETURN`, if wrappers change rewards.
-        generators: kinds of global generators that the environment draws from.
-        n_masked: actions of the mask in ``info["action_mask"]``, see `masked_actions`.
-    """
-
+    #: Keys of the numbers in its last ``info``, `is_success` first; before them `TRUE_RETURN`, if
+    #: wrappers change rewards.
     names: tuple[str, ...] = ()
-    generators: tuple[str, ...] = ()
-    n_masked: int = 0
+    generators: tuple[str, ...] = ()  # kinds of global ones that the environment draws from
+    n_masked: int = 0  # see `masked_actions`
 
 
 class RewardRecorder(gymnasium.Wrapper):

@@ -25,9 +25,8 @@ PATIENCE = 5
 
 
 class VectorProcesses:
-    """N environments in worker processes, with the interface and the numbers of
-    :class:`~megastep.hosting.hosted.HostedEnvs`. The workers end with :meth:`close`, with this
-    object, or with the process that made it, even if that is killed.
+    """N environments in worker processes, with the interface and the numbers of `HostedEnvs`. The
+    workers end with :meth:`close`, with this object, or with the process that made it.
     """
 
     max_episode_steps: int | None = None
