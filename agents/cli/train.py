@@ -167,9 +167,6 @@ def ready(cfg: settings.Train) -> None:
         automatic(cfg)
     elif cfg.resume is None:
         folders.check_free(cfg.folder)
-    else:
-        with folders.locked(folders.folder_of(folders.find(cfg.resume, None))):
-            pass
 
 
 def run(cfg: settings.Train) -> Path | None:

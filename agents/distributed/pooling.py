@@ -64,26 +64,19 @@ def pool_moments(*moments: Moments) -> list[Moments]:
     statistics = torch.cat([column.flatten() for column in (*own_means, *own_variances)])
     rows = all_gather(torch.cat([torch.stack(own_counts).double(), statistics.double()]))
     counts, means, variances = rows.split([len(sizes), sum(sizes), sum(sizes)], 1)
-    n = _in_common_dtype(counts.sum(0), own_counts)
+    n = counts.sum(0)
     # one count per entry of a mean
     columns = counts.split(1, 1)
     counts = torch.cat([column.expand(-1, size) for column, size in zip(columns, sizes)], 1)
     divisor = counts.sum(0).clamp(min=1)
     mean = (counts * means).sum(0) / divisor
     variance = (counts * (variances + (means - mean).square())).sum(0) / divisor
-    mean, variance = _in_common_dtype(torch.stack([mean, variance]), own_means)
     pooled = zip(n, mean.split(sizes), variance.split(sizes), strict=True)
     moments_of_all = [
         tuple(new.view_as(old).to(old.dtype) for new, old in zip(each, before, strict=True))
         for each, before in zip(pooled, moments, strict=True)
     ]
     return cast("list[Moments]", moments_of_all)
-
-
-def _in_common_dtype(x, others) -> torch.Tensor:
-    """Returns x in the dtype of the others if they agree: one kernel instead of one for each."""
-    dtypes = {other.dtype for other in others}
-    return x.to(*dtypes) if len(dtypes) == 1 else x
 
 
 def pool_with_condition(

@@ -109,7 +109,15 @@ class Job:
                 env = shared | dict(RANK=number, LOCAL_RANK=number)
                 words = [sys.executable, "-c", CODE]
                 self.processes.append(subprocess.Popen(words, env=env, start_new_session=True))
-        store = opened_store(listener)  # while the ranks import modules; answers as long as it is
+        from torch import distributed  # while the ranks import modules
+
+        store = distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
+            *listener.getsockname(),
+            is_master=True,
+            timeout=datetime.timedelta(seconds=300),
+            wait_for_workers=False,
+            master_listen_fd=listener.detach(),
+        )  # answers as long as it lives
         while True:
             codes = [process.poll() for process in self.processes]
             failure = failure or next(((n, code) for n, code in enumerate(codes) if code), None)
@@ -148,19 +156,6 @@ class Job:
         hint = folders.to_continue(Path(path.read_text()) if path.exists() else None)
         label = f"rank {number} on {environment.hostname()}"
         return endings.Ending(endings.LOST, f"{label} {text}. {hint}")
-
-
-def opened_store(listener: socket.socket) -> object:
-    """Returns the ranks' key-value store, which answers at a socket as long as it lives."""
-    from torch import distributed
-
-    return distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
-        *listener.getsockname(),
-        is_master=True,
-        timeout=datetime.timedelta(seconds=300),
-        wait_for_workers=False,
-        master_listen_fd=listener.detach(),
-    )
 
 
 def variables(job: Path, n_ranks: int) -> dict[str, str]:

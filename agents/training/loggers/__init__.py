@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from megastep.agents.errors import shortened
 from megastep.agents.runs.json_lines import JsonLines, truncate_after
 from megastep.agents.types import Logger, RunResult
 
@@ -55,7 +56,7 @@ class Loggers:
             try:
                 self.others[name] = make()
             except Exception as error:
-                warnings.warn(f"logger={name} skipped: {first_line(error)}", stacklevel=2)
+                warnings.warn(f"logger={name} skipped: {shortened(error, 300)}", stacklevel=2)
 
     def on_report(self, trainer: "Trainer", metrics: Mapping[str, float | str]) -> None:
         """Writes a report."""
@@ -92,10 +93,5 @@ class Loggers:
                 getattr(logger, method)(*args)
             except Exception as error:
                 del self.others[name]
-                text = f"logger={name} failed and is dropped ({first_line(error)})"
+                text = f"logger={name} failed and is dropped ({shortened(error, 300)})"
                 warnings.warn(text, stacklevel=3)
-
-
-def first_line(error: Exception) -> str:
-    """Returns the first line of an error's message, or its class's name."""
-    return (str(error) or type(error).__name__).splitlines()[0]

@@ -7,8 +7,8 @@ from types import ModuleType
 from typing import Literal
 
 from megastep.agents import package
+from megastep.agents.errors import shortened
 from megastep.agents.runs import provenance
-from megastep.agents.training.loggers import first_line
 from megastep.agents.types import RunResult
 from megastep.atomic_files import write_atomically
 
@@ -68,7 +68,7 @@ class Wandb:
             )
             write_atomically(id_file, self.run.id.encode())
         except Exception as error:  # wandb raises its own errors, the network's and the system's
-            raise RuntimeError(f"it did not start ({first_line(error)})") from None
+            raise RuntimeError(f"it did not start ({shortened(error, 300)})") from None
 
     @staticmethod
     def _has_key(wandb: ModuleType) -> bool:
