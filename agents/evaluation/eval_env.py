@@ -81,17 +81,13 @@ class EvalEnv:
         homes: geometries; none if the environment takes none.
         episodes: number of episodes, one per lane. If there are fewer environments than homes, they
             are in evenly spaced ones; if more, their number is rounded up to a multiple of homes.
-        seed: of spawns.
         is_shared: the ranks share the environments. Otherwise each makes all of them.
         is_duel: makes environments for two where the number of agents can be set, an episode each,
-            as many in each home as there are teams (slots, without roles), or a multiple. Raises
-            UserError for one agent.
+            as many in each home as there are teams, or a multiple. UserError for one agent.
 
     Attributes:
         env, sample: the environment, with this rank's share of all lanes, and a small one.
-        settings: those of `env`.
         homes: the geometries played in.
-        shard: this rank's share.
         own: (n_envs, n_agents) bool, the agents that are evaluated, in duels.
     """
 

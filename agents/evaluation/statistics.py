@@ -36,17 +36,14 @@ def interval(
     n_resamples: int = 2000,
     seed: int = 1,
 ) -> tuple[float, float, float]:
-    """Returns a mean and its bootstrap confidence interval: `(mean, lower, upper)`.
+    """Returns the mean of values (B,) and its bootstrap interval: `(mean, lower, upper)`.
 
     Lanes in the same home are correlated, so whole groups are resampled (the cluster bootstrap;
     Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3). Each resample's
     estimate is the mean over its lanes, so larger groups weigh more.
 
     Args:
-        values: (B,).
-        groups: (B,) integers, the home of each lane. Lanes are resampled if there is no group or
-            only one.
-        level: probability that the interval covers the mean.
+        groups: (B,) integers, the home of each lane. None or one: lanes are resampled.
     """
     values = np.asarray(values, float)
     if groups is None or len(np.unique(groups)) == 1:

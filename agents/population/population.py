@@ -113,8 +113,7 @@ class Population:
     A member that diverges goes on without learning, and copies another at the next generation.
 
     Args:
-        trainers: of the members that this rank hosts, made in `streams`. All do the updates that
-            the first plans.
+        trainers: of the members that this rank hosts, made in `streams`. The first plans for all.
         folder: where `population.jsonl` is written.
         chosen: its settings. A generation is at the first report after `every` samples, and none
             when the budget is spent.
@@ -124,8 +123,6 @@ class Population:
     Attributes:
         members: numbers of the members that this rank hosts.
         settings: of each member, by key.
-        generation: the number of the last one.
-        n_diverged: how often each member has diverged.
     """
 
     def __init__(

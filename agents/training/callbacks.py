@@ -166,8 +166,7 @@ class Tuning:
 
 class NonFiniteGuard:
     """Warns of the first NaN or infinity of a run, and ends a run whose updates are all skipped:
-    the learner skips those with one, see `nonfinite.NonFiniteCheck`. All ranks call it at the same
-    updates; they exchange what they found.
+    the learner skips those with one, see `nonfinite.NonFiniteCheck`. Ranks exchange what they find.
 
     Attributes:
         value: the first NaN or infinity of the run, or None.

@@ -36,10 +36,9 @@ class SFL:
     the outcomes of its episodes. A class of your own has the four methods below. Raises ValueError:
     the environment has no two homes to draw, or no metric tells the outcome.
 
-    Of a success with probability p that is the paper's learnability p (1 - p): 0 in homes that are
-    always solved or never, most where half of the episodes succeed. The paper samples from the most
-    learnable of homes that it rolls out apart; here the episodes that train tell the learnability
-    of all homes. An unseen home has the largest score, 1/4.
+    Of a success with probability p that is the paper's learnability p (1 - p), most where half of
+    the episodes succeed. The paper rolls homes out apart; here the episodes that train tell. An
+    unseen home has the largest score, 1/4.
 
     Args:
         env: environment that draws a layout for each episode.

@@ -39,11 +39,9 @@ _SAVED = "totals", "is_whole", "began", "sums"
 
 
 class EpisodeStats:
-    """Accumulates return, length and metrics of episodes. Only `pop` synchronises.
-
-    Of the episodes that end in an interval, there are too many short ones: at the beginning of a
-    run, no other can have ended. So `pop` reports on those that *began* in an interval, once all of
-    them have ended.
+    """Accumulates return, length and metrics of episodes. Only `pop` synchronises: it reports on
+    episodes that *began* in an interval, once all have ended; of those that end in one, too many
+    are short.
 
     Args:
         metrics: names of the metrics that worlds carry.
@@ -61,9 +59,7 @@ class EpisodeStats:
         sums: (C, S, K) float64, over the episodes that began in an interval and have ended: count,
             return, squared return, length, each metric, and for each metric how many episodes were
             left out of it, and for how many of these it was not NaN.
-        windows: for each column, the sums of the last reports of all ranks, of which the others
-            than the oldest hold fewer than `MIN_EPISODES`.
-        infinite: metrics that were infinite or too large, in the last report.
+        windows: for each column, the sums of the last reports with `MIN_EPISODES` together.
     """
 
     def __init__(
@@ -146,9 +142,8 @@ class EpisodeStats:
     ) -> dict[str, float]:
         """Returns statistics for a report, and begins an interval. Synchronises.
 
-        Means are over the episodes of the intervals between reports whose episodes have all ended
-        since the last call, in the order of the intervals, and if these are fewer than
-        `MIN_EPISODES`, those of earlier calls, a call at a time. They are absent if there are none.
+        Means are over the episodes of intervals whose episodes have all ended since the last call,
+        and if these are fewer than `MIN_EPISODES`, those of earlier calls, a call at a time.
         `sum_over_ranks` adds the numbers of the other ranks.
 
         Metrics:
@@ -221,9 +216,7 @@ class EpisodeStats:
         return state | dict(windows=windows, intervals=[*self.intervals])
 
     def load_state_dict(self, state: StateDict, has_episodes: bool = True) -> None:
-        """Restores a `state_dict`, unless it has other metrics or groups; without its episodes, of
-        which others than the short ones are lost, only what earlier reports have counted.
-        """
+        """Restores a `state_dict`, unless it has other metrics or groups; or just the reports."""
         if state["sums"].shape != self.sums.shape:
             return
         self.windows = [deque(window.tolist()) for window in state["windows"]]
@@ -256,9 +249,7 @@ def _add_report(window, report) -> list[float]:
 
 
 class Episodes:
-    """A callback that counts a trainer's episodes in `stats`, on a GPU by a CUDA graph, and gives
-    the curriculum and the environment's `opponents`, if any, their share.
-    """
+    """A callback that counts a trainer's episodes, for the curriculum and `opponents`, too."""
 
     def __init__(self, trainer: Trainer):
         self.opponents = optional(trainer.env, "opponent_pool")

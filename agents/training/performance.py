@@ -20,11 +20,8 @@ MAX_AHEAD = 8
 
 
 class Timing:
-    """Reports rates and times, and keeps the host near a GPU.
-
-    There a phase lasts from the time its first kernel can start to that of the next phase on the
-    current stream, by CUDA events. Work on other streams counts only where that stream waits for
-    it.
+    """Reports rates and times, and keeps the host near a GPU. There CUDA events on the current
+    stream divide the phases; other streams count where that one waits for them.
 
     Attributes:
         times_phases: false for a member of a population but the first, as members share the device.

@@ -19,10 +19,7 @@ N_ROWS, MAX_NAME = 100, 90
 class Profiler:
     """Profiles some updates of a run with `torch.profiler` and writes two files into its folder:
     `profile.json.gz`, a Chrome trace (for https://ui.perfetto.dev), and `profile.txt`, PyTorch's
-    table of the phases and operations that took longest. On a GPU these are its kernels, those in
-    CUDA graphs included.
-
-    A profile that cannot be made causes a warning and no error.
+    table of the phases and operations, on a GPU kernels, that took longest. If it fails, it warns.
 
     Args:
         folder: the run folder.

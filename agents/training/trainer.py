@@ -45,15 +45,12 @@ class Trainer:
         rollout, metrics: the latest rollout, and the last report.
         latest_stats, evaluation: name -> the last value of each statistic of episodes, and of each
             number that an evaluation in training measured.
-        score: what checkpoints are compared by: the mean return of the last report, or None before
-            `MIN_EPISODES` have ended: that of few episodes is luck. With evaluations in training,
-            the return that the last one measured, None after another update.
+        score: what checkpoints are compared by: the mean return of the last report with
+            `MIN_EPISODES`, or of the last evaluation in training.
         is_save_due: a checkpoint follows the report.
-        lost: what could not be restored of a resumed run, a clause each; if any, it does not
-            continue bit for bit.
+        lost: what could not be restored of a resumed run, a clause each.
         samples_at_report: samples at the last report that was due; a resumed run writes the later.
         curriculum: draws the homes of new episodes; None: the environment does.
-        timing, tuning, episodes, nonfinite_guard: the callbacks that every training has.
     """
 
     def __init__(
@@ -196,9 +193,8 @@ class Trainer:
         self.callbacks("on_report", self, self.metrics)
 
     def save(self, state: StateDict | None = None, is_last: bool = False) -> None:
-        """Begins to save a checkpoint of a state of `run_state`, by default that of now, unless the
-        last one holds every update, or a callback's `may_save` returns False, which the last one
-        does not ask. All ranks call it.
+        """Begins to save a checkpoint, by default of now, unless the last one holds every update,
+        or a callback's `may_save` returns False; the last one does not ask. All ranks call it.
         """
         self.seconds_at_checkpoint = self.clock.seconds
         if not self.ranks.any(not self.is_saved or (is_last and self.saver.lacks_replay)):
