@@ -21,7 +21,7 @@ from megastep.agents.networks.plain_cores import Feedforward
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.web import LIBRARY
-from megastep.web.program import Launch, Leaf, Program, Ref
+from megastep.web.program import Launch, Leaf, Program, Ref, words
 
 FLOAT = 4  # bytes
 KINDS = {torch.float16: 0, torch.float32: 1, torch.uint8: 2, torch.bool: 2, torch.int64: 3}
@@ -76,8 +76,8 @@ class _Lowering:
 
     def launch(self, operation: str, **values) -> None:
         """Adds a launch. Words that are not given are 0, or null pointers."""
-        words = LIBRARY.words[LIBRARY.cpu_operations[operation]]
-        empty = {word.name: None if word.kind == "P" else 0 for word in words}
+        layout = words(LIBRARY, operation)
+        empty = {word.name: None if word.kind == "P" else 0 for word in layout}
         assert values.keys() <= empty.keys(), values.keys() - empty.keys()
         values = empty | values | dict(n_lanes=self.n) if "n_lanes" in empty else empty | values
         self.launches.append(Launch(LIBRARY, operation, values))

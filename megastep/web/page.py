@@ -16,7 +16,7 @@ from megastep.kernels.build.launch import ENGINE
 from megastep.modules import MOVES
 from megastep.plotting.styles import AGENTS, THEMES
 from megastep.types import Env, n_lanes, optional
-from megastep.web.program import Buffer, Launch, Leaf, Program, Ref
+from megastep.web.program import Buffer, Launch, Leaf, Program, Ref, words
 
 __all__ = ["SHIPPED", "module", "page", "scene"]
 
@@ -110,9 +110,8 @@ def _leaf(leaf: Leaf) -> list:
 
 def _values(launch: Launch) -> list:
     """The words of a launch: places as [buffer, offset], numbers as their 32 bits."""
-    words = launch.library.words[launch.library.cpu_operations[launch.operation]]
     values = []
-    for word in words:
+    for word in words(launch.library, launch.operation):
         value = launch.values[word.name]
         if value is None or isinstance(value, Ref):
             values.append(value and [*value])

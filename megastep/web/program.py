@@ -1,10 +1,11 @@
 """Programs: launches of kernels, and the memory that they read and write."""
 
 import ctypes
+import functools
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -12,6 +13,35 @@ from megastep.kernels.build.compile import cpu
 from megastep.kernels.build.kernel_library import KernelLibrary
 
 __all__ = ["Buffer", "Launch", "Leaf", "Program", "Ref", "Replay"]
+
+
+class Word(NamedTuple):
+    """A pointer or number of a struct."""
+
+    name: str  # of the field, such as `radius`, or `scenery.radius` in a struct that is a field
+    kind: str  # its format, of the module struct
+    offset: int  # in bytes, with pointers of this machine
+
+
+@functools.cache
+def words(library: KernelLibrary, operation: str) -> list[Word]:
+    """Returns all pointers and numbers of an operation's struct, those of structs that are fields
+    too. Where pointers take 4 bytes, as in WebAssembly, a struct is an array of them, 4 bytes each.
+    """
+    return [*_words(library.structs[library.cpu_operations[operation]])]
+
+
+def _words(layout, title="", start=0) -> Iterator[Word]:
+    for name, kind in layout._all_fields_:
+        at = start + getattr(layout, name).offset
+        if issubclass(kind, ctypes.Array):
+            one: Any = kind._type_
+            for k in range(ctypes.sizeof(kind) // ctypes.sizeof(one)):
+                yield from _words(one, f"{title}{name}.{k}.", at + k * ctypes.sizeof(one))
+        elif issubclass(kind, ctypes.Structure):
+            yield from _words(kind, f"{title}{name}.", at)
+        else:
+            yield Word(title + name, kind._type_, at)
 
 
 class Ref(NamedTuple):
@@ -114,10 +144,10 @@ class Replay:
 
     def _call(self, launch: Launch) -> tuple[Callable[[bytes], None], bytes]:
         library, name, values = launch
-        words = library.words[library.cpu_operations[name]]
-        end = max(word.offset + struct.calcsize(word.kind) for word in words)
+        layout = words(library, name)
+        end = max(word.offset + struct.calcsize(word.kind) for word in layout)
         packed = bytearray(-8 * (-end // 8))
-        for word in words:
+        for word in layout:
             value = values[word.name]
             if isinstance(value, Ref):
                 value = self._addresses[value.buffer] + value.offset

@@ -19,7 +19,7 @@ from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import observed
 from megastep.spaces import random_actions
 from megastep.types import Env, World, n_lanes, optional
-from megastep.web.program import Buffer, Launch, Leaf, Program, Ref, Replay
+from megastep.web.program import Buffer, Launch, Leaf, Program, Ref, Replay, words
 
 __all__ = ["record"]
 
@@ -69,7 +69,7 @@ class Tape(TorchDispatchMode):
 
     def observe(self, library: KernelLibrary, operation: str, packed: bytes) -> None:
         values = {}
-        for word in library.words[library.cpu_operations[operation]]:
+        for word in words(library, operation):
             (value,) = struct.unpack_from(word.kind, packed, word.offset)
             if word.kind == "P" and value:
                 start = self.recorder.find(value)

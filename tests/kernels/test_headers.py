@@ -9,6 +9,7 @@ import pytest
 
 from megastep.kernels.build import compile, kernel_library
 from megastep.kernels.build.launch import ENGINE
+from megastep.web import program
 
 LIBRARIES = {"/".join(one.folder.parts[-3:]): one for one in check_kernels.libraries()}
 libraries = pytest.mark.parametrize("library", LIBRARIES.values(), ids=LIBRARIES)
@@ -82,9 +83,14 @@ struct MoreParams : PointerParams {
 """
 
 
+def structs_of(folder, text):
+    (folder / "params.h").write_text(text)
+    return kernel_library.KernelLibrary(folder).structs
+
+
 def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
     """Structs without a pointer have other sizes and places than those with one."""
-    structs = kernel_library.structs({"params.h": NESTED})
+    structs = structs_of(tmp_path, NESTED)
     pack = {name: kernel_library.packer(layout) for name, layout in structs.items()}
     numbers = [dict(count=i, size=i + 0.5, mask=2**31 + i) for i in range(2)]
     pointers = [dict(count=5 + i, values=2**40 + i, size=-i) for i in range(2)]
@@ -123,9 +129,9 @@ def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
         assert getattr(checks, f"check_{name}")(data, len(data)), name
 
 
-def test_words_are_the_scalars_of_nested_structs_in_order():
-    structs = kernel_library.structs({"params.h": NESTED})
-    words = {name: [*kernel_library._words(layout)] for name, layout in structs.items()}
+def test_words_are_the_scalars_of_nested_structs_in_order(tmp_path):
+    structs = structs_of(tmp_path, NESTED)
+    words = {name: [*program._words(layout)] for name, layout in structs.items()}
     assert words["OneParams"] == [
         ("first", "i", 0),
         *(("one.count", "i", 4), ("one.size", "f", 8), ("one.mask", "I", 12)),
@@ -157,9 +163,9 @@ def test_constants_are_those_of_headers_that_are_plain_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("field", ["double x;", "float x, y;", "OtherParams other;", "int x[3];"])
-def test_a_field_that_cannot_be_packed_is_named(field):
+def test_a_field_that_cannot_be_packed_is_named(field, tmp_path):
     with pytest.raises(ValueError, match="params.h: .*" + re.escape(field[:-1])):
-        kernel_library.structs({"params.h": f"struct AParams {{\n    int a;\n    {field}\n}};\n"})
+        structs_of(tmp_path, f"struct AParams {{\n    int a;\n    {field}\n}};\n")
 
 
 def test_a_field_that_is_missing_or_unknown_is_named():

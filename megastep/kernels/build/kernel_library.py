@@ -12,11 +12,11 @@ sources, so that structs, constants and operations are declared once:
 import ctypes
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 #: The folder of the engine's kernels. Its headers in ``common/`` are for all kernel libraries.
 KERNELS = Path(__file__).parents[1]
@@ -65,14 +65,6 @@ def packed(**values):
 """
 
 
-class Word(NamedTuple):
-    """A pointer or number of a struct."""
-
-    name: str  # of the field, such as `radius`, or `scenery.radius` in a struct that is a field
-    kind: str  # its format, of the module struct
-    offset: int  # in bytes, with pointers of this machine
-
-
 class KernelLibrary:
     """The kernels in one folder, which are built together when one is first launched.
 
@@ -88,9 +80,8 @@ class KernelLibrary:
 
     Attributes:
         constants: {name: number} of the folder's and the common headers.
-        structs: {struct: its layout in memory}.
-        words: {struct: all its pointers and numbers}, those of structs that are fields too. Where
-            pointers take 4 bytes, as in WebAssembly, a struct is an array of them, 4 bytes each.
+        structs: {struct: its layout in memory}, each ``...Params`` in the headers. Others that it
+            holds, or begins with, are declared before it. ValueError if a field cannot be packed.
         params: functions that pack a struct: ``params.RowParams(n=64, ...)``.
         cpu_operations, cuda_operations: {operation: struct} for the CPU and the GPU.
         early_operations: those that a GPU may start before the previous kernel has ended: their
@@ -117,11 +108,26 @@ class KernelLibrary:
 
     @cached_property
     def structs(self) -> dict[str, type[ctypes.Structure]]:
-        return structs(self.sources(".h"))
-
-    @cached_property
-    def words(self) -> dict[str, list[Word]]:
-        return {name: [*_words(layout)] for name, layout in self.structs.items()}
+        found: dict[str, Any] = {}
+        for header, text in self.sources(".h").items():
+            for name, base, body in STRUCT.findall(COMMENT.sub("", text)):
+                parent: Any = found[base] if base else ctypes.Structure
+                own: list[tuple[str, Any]] = []
+                for line in body.split(";")[:-1]:
+                    match = FIELD.fullmatch(line.strip())
+                    kind = ctypes.c_void_p if match and match[2] else None
+                    kind = kind or match and (TYPES.get(match[1]) or found.get(match[1]))
+                    if not match or not kind or match[4] and match[1] not in found:
+                        raise ValueError(
+                            f"{header}: cannot pack the field '{' '.join(line.split())}'. A field "
+                            "is a pointer, an int, an unsigned int, a float, or a struct ...Params "
+                            "declared above or an array of them."
+                        )
+                    own.append((match[3], kind * int(match[4]) if match[4] else kind))
+                # with those that it begins with
+                fields = [*getattr(parent, "_all_fields_", ()), *own]
+                found[name] = type(name, (parent,), {"_fields_": own, "_all_fields_": fields})
+        return found
 
     @cached_property
     def params(self) -> SimpleNamespace:
@@ -155,44 +161,6 @@ class KernelLibrary:
 def kernels(sources: Mapping[str, str]) -> list[re.Match[str]]:
     """Returns matches of `OPERATION` in sources {name: text}: [2] is the name, [3] the struct."""
     return [one for text in sources.values() for one in OPERATION.finditer(COMMENT.sub("", text))]
-
-
-def structs(sources: Mapping[str, str]) -> dict[str, type[ctypes.Structure]]:
-    """Returns every struct ``...Params`` in the headers ``sources`` {name: text}. Others that it
-    holds, or begins with, are declared before it. ValueError if a field cannot be packed.
-    """
-    found: dict[str, Any] = {}
-    for header, text in sources.items():
-        for name, base, body in STRUCT.findall(COMMENT.sub("", text)):
-            parent: Any = found[base] if base else ctypes.Structure
-            own: list[tuple[str, Any]] = []
-            for line in body.split(";")[:-1]:
-                match = FIELD.fullmatch(line.strip())
-                kind = ctypes.c_void_p if match and match[2] else None
-                kind = kind or match and (TYPES.get(match[1]) or found.get(match[1]))
-                if not match or not kind or match[4] and match[1] not in found:
-                    raise ValueError(
-                        f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a "
-                        "pointer, an int, an unsigned int, a float, or a struct ...Params declared "
-                        "above or an array of them."
-                    )
-                own.append((match[3], kind * int(match[4]) if match[4] else kind))
-            fields = [*getattr(parent, "_all_fields_", ()), *own]  # with those that it begins with
-            found[name] = type(name, (parent,), {"_fields_": own, "_all_fields_": fields})
-    return found
-
-
-def _words(layout, title="", start=0) -> Iterator[Word]:
-    for name, kind in layout._all_fields_:
-        at = start + getattr(layout, name).offset
-        if issubclass(kind, ctypes.Array):
-            one: Any = kind._type_
-            for k in range(ctypes.sizeof(kind) // ctypes.sizeof(one)):
-                yield from _words(one, f"{title}{name}.{k}.", at + k * ctypes.sizeof(one))
-        elif issubclass(kind, ctypes.Structure):
-            yield from _words(kind, f"{title}{name}.", at)
-        else:
-            yield Word(title + name, kind._type_, at)
 
 
 def packer(layout: Any) -> Callable[..., bytes]:
