@@ -148,8 +148,7 @@ class GradientLearner:
         if self.critic_lr is not None and policy.critic is not None:
             factors = dict.fromkeys(policy.critic.parameters(), self.critic_lr / self.lr)
         layers = (p for name, p in policy.named_parameters() if p.ndim > 1 and "weight" in name)
-        has_extra = type(self).extra_parameters is not GradientLearner.extra_parameters
-        self.extra = self._make_extra() if has_extra else []
+        self.extra = self._make_extra()
         self.steps = GradientSteps(
             [*policy.parameters(), *self.extra],
             self.coefficients.tensors["lr"],

@@ -66,8 +66,8 @@ class NonFiniteValue:
         return dataclasses.replace(self, lane=int(lanes[self.lane]), n_agents=n_agents)
 
     def __str__(self) -> str:
-        lane = lane_name(self.lane, self.n_agents)
-        text = f"{self.name} of {lane} was {self.size:.3g} at step {self.step:,}"
+        env = f" (environment {self.lane // self.n_agents})" if self.n_agents > 1 else ""
+        text = f"{self.name} of lane {self.lane}{env} was {self.size:.3g} at step {self.step:,}"
         if (n_others := self.n_lanes - 1) > 0:
             text += f"; and so for {n_others:,} more lane{'s' * (n_others > 1)}"
         return text
@@ -193,11 +193,6 @@ class NonFiniteCheck:
         step = (int(rollout) - 1) * n_steps + row
         value = NonFiniteValue(list(floats)[i], lane, step, size, int(rollout), int(n_bad))
         return value, int(n_skipped)
-
-
-def lane_name(lane: int, n_agents: int) -> str:
-    """Returns a lane's name for messages, with its environment if it has several lanes."""
-    return f"lane {lane}" + (f" (environment {lane // n_agents})" if n_agents > 1 else "")
 
 
 def nonfinite_leaf(tree: Tree) -> str | None:

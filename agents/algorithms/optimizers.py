@@ -18,6 +18,10 @@ from megastep.kernels.build.launch import Blocks, launch
 
 #: Adam's weight decay is decoupled, so that with one it is AdamW.
 NAMES = ("adam", "adamw")
+#: Decay of the running means of gradients and of squared gradients.
+BETAS = 0.9, 0.999
+#: Added to the denominator.
+EPS = 1e-5
 Factors = Mapping[torch.nn.Parameter, float]
 _MAX_ROWS = LIBRARY.constants["ADAM_ROWS"]
 _THREADS = LIBRARY.constants["ADAM_THREADS"]
@@ -54,8 +58,6 @@ class Adam(_Optimizer):
     Args:
         parameters: parameters to optimise.
         lr: step size, a tensor () on their device that may be changed in place.
-        betas: decay of the running means of gradients and of squared gradients.
-        eps: added to the denominator.
         lr_factors: factors of `lr` for some of the parameters; 1 for the others.
         weight_decays: weight decays of some of the parameters, from each of which a step also
             subtracts step size x decay x parameter; 0 for the others.
@@ -67,13 +69,10 @@ class Adam(_Optimizer):
         self,
         parameters: Iterable[torch.nn.Parameter],
         lr: torch.Tensor,
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-5,
         lr_factors: Factors = _NONE,
         weight_decays: Factors = _NONE,
     ):
         super().__init__(parameters, lr, lr_factors, weight_decays)
-        self.betas, self.eps = betas, eps
         self.means = [torch.zeros_like(p) for p in self.parameters]
         self.squares = [torch.zeros_like(p) for p in self.parameters]
 
@@ -112,10 +111,10 @@ class Adam(_Optimizer):
                 max_exp_avg_sqs=[],
                 state_steps=[self.n_steps] * len(rows),
                 lr=self.lr if factor == 1 else self.lr * factor,
-                beta1=self.betas[0],
-                beta2=self.betas[1],
+                beta1=BETAS[0],
+                beta2=BETAS[1],
                 weight_decay=weight_decay,
-                eps=self.eps,
+                eps=EPS,
                 amsgrad=False,
                 maximize=False,
                 found_inf=(~is_taken).float(),
@@ -219,7 +218,7 @@ def _update_on_gpu(adam, is_taken, grad_norm, max_norm) -> None:
             *(LIBRARY, "adam", adam.lr.device, Blocks(n_blocks, threads=_THREADS)),
             **dict(rows=b"".join(rows), n_rows=len(rows), lr=adam.lr, n_steps=adam.n_steps),
             **dict(grad_norm=grad_norm, is_taken=is_taken, max_norm=max_norm),
-            **dict(beta1=adam.betas[0], beta2=adam.betas[1], eps=adam.eps),
+            **dict(beta1=BETAS[0], beta2=BETAS[1], eps=EPS),
         )
 
 

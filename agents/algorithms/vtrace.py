@@ -23,7 +23,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import add_moments, masked_moments
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings, replay_size
-from megastep.agents.storage.rollout import without_last
+from megastep.agents.storage.rollout import SEQUENCES, without_last
 from megastep.arrdict import arrdict, cat
 from megastep.dotdict import mapping
 from megastep.settings import checked
@@ -139,13 +139,24 @@ class VTrace(learner.ActorCritic):
         return self.steps.end()
 
     def _batch(self, rollout, lanes) -> arrdict:
-        batch = rollout.sequences(lanes)
+        """Returns sequences of some lanes, then replayed ones, which have `learns` false until the
+        buffer is ready; and `index` of these.
+        """
+        batch, replay = rollout.sequences(lanes), self.replay_buffer
         batch = arrdict(batch, weight=torch.ones_like(batch.reward[0]), age=torch.zeros_like(lanes))
-        if self.replay_buffer is None:
+        if replay is None:
             return batch
-        n_replayed = max(1, round(self.replay_buffer.settings.ratio * len(lanes)))
-        generator = self.generator.on(self.device)
-        return with_replayed(batch, self.replay_buffer, self.policy, n_replayed, generator)
+        n, n_burnt = max(1, round(replay.settings.ratio * len(lanes))), replay.settings.burn_in
+        replayed = replay.sample(n, self.generator.on(self.device))
+        if n_burnt:
+            first, rest = mapping(lambda x: x[:n_burnt]), mapping(lambda x: x[n_burnt:])
+            sequence = first(replayed.obs), first(replayed.starts)
+            state = self.policy.warm_up(*sequence, replayed.state)
+            parts = {key: rest(x) if key in SEQUENCES else x for key, x in replayed.items()}
+            replayed = arrdict(parts, state=state)
+        replayed["learns"] = replayed.learns & replay.is_ready
+        joined = {key: cat([batch[key], replayed[key]], int(key in SEQUENCES)) for key in batch}
+        return arrdict(joined, index=replayed.index)
 
     def _losses(self, batch, n_fresh) -> tuple[torch.Tensor, dict[str, torch.Tensor], arrdict]:
         """Returns loss, metrics () and V-trace's estimates; the first `n_fresh` lanes are new."""
@@ -208,32 +219,3 @@ class VTrace(learner.ActorCritic):
             clip_fraction=masked_mean((ratio > rho_clip).float(), valid),
             effective_samples=effective_sample_size(ratio, valid),
         )
-
-
-# ---- Fresh sequences followed by replayed ones ----
-
-# keys with a time axis
-_IN_TIME = (
-    *("obs", "privileged", "starts", "learns", "mask"),
-    *("actions", "logprobs", "reward", "terminal", "truncated"),
-)
-
-
-def with_replayed(
-    batch: arrdict, replay: ReplayBuffer, policy: Policy, n: int, generator: torch.Generator
-) -> arrdict:
-    """Returns a fresh batch followed by n replayed sequences, (T, M + n, ...).
-
-    Burn-in steps warm up the hidden state and are then removed. Until the buffer is ready, replayed
-    sequences have `learns` false. `index` (n,) is for `ReplayBuffer.set_priorities`.
-    """
-    replayed, n_burnt = replay.sample(n, generator), replay.settings.burn_in
-    if n_burnt:
-        first = mapping(lambda leaf: leaf[:n_burnt])
-        state = policy.warm_up(first(replayed.obs), first(replayed.starts), replayed.state)
-        rest = mapping(lambda leaf: leaf[n_burnt:])
-        parts = {key: rest(x) if key in _IN_TIME else x for key, x in replayed.items()}
-        replayed = arrdict(parts, state=state)
-    replayed["learns"] = replayed.learns & replay.is_ready
-    joined = {key: cat([batch[key], replayed[key]], int(key in _IN_TIME)) for key in batch}
-    return arrdict(joined, index=replayed.index)

@@ -16,7 +16,6 @@ from megastep.arrdict import arrdict
 from megastep.kernels.build import kernel_library
 from megastep.kernels.build.compile import EngineError, cpu
 from megastep.kernels.build.kernel_library import KernelLibrary
-from megastep.kernels.build.launch import launch
 
 # Unlike in the engine, no bits have to agree: fused multiply-adds.
 _CPU_FLAGS = tuple(
@@ -90,17 +89,6 @@ def has_hopper(device: torch.device, n_bytes: int) -> bool:
     """Returns whether a GPU is a Hopper or later, with so many bytes of shared memory per block."""
     gpu = torch.cuda.get_device_properties(device)
     return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= n_bytes
-
-
-def launch_units(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> None:
-    """Launches a kernel of a recurrent core: a thread has one or four neighbouring units of a lane.
-    Tensors are contiguous, and start at a multiple of 16 bytes if the width is one of 4.
-    """
-    n_lanes, width = state.shape
-    n_units = 1 if width % 4 else 4
-    fields |= dict(n_lanes=n_lanes, width=width, n_units=n_units)
-    n_threads = state.numel() // n_units
-    launch(LIBRARY, f"{operation}_{DTYPES[dtype]}", state.device, n_threads, **fields)
 
 
 def aligned(tensor: torch.Tensor) -> torch.Tensor:

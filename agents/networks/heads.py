@@ -13,7 +13,7 @@ choices of each.
 
 import math
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import nn
@@ -226,33 +226,11 @@ class DictOutput(Output):
     def forward(self, x: torch.Tensor) -> arrdict:
         return arrdict({key: output(x) for key, output in self.outputs.items()})
 
-    def act(
-        self,
-        x: torch.Tensor,
-        sample: bool = True,
-        generator: torch.Generator | None = None,
-        mask: Tree = None,
-        **options: torch.Tensor,
-    ) -> tuple[arrdict, arrdict, torch.Tensor]:
-        """Acts key by key."""
-        outputs = typing.cast("Mapping[str, Output]", self.outputs)
-        parts = {
-            key: output.act(x, sample, generator, (mask or {}).get(key), **options)
-            for key, output in outputs.items()
-        }
-        logits, actions, logprobs = zip(*parts.values())
-        return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), _total(logprobs)
-
     def masked(self, logits: Tree, mask: Tree = None) -> Tree:
         """Masks key by key."""
         if mask is None:
             return logits
         return self._each("masked", logits, {key: mask.get(key) for key in logits})
-
-    def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
-        """Sums the outputs' terms."""
-        logprobs, entropies = zip(*self._each("terms", logits, actions).values())
-        return _total(logprobs), _total(entropies)
 
     def sample(
         self, logits: Tree, generator: torch.Generator | None = None, **options: torch.Tensor
@@ -266,16 +244,16 @@ class DictOutput(Output):
 
     def logprob(self, logits: Tree, actions: Tree) -> torch.Tensor:
         """Returns the log-probability (...,) of actions."""
-        return _total(self._each("logprob", logits, actions).values())
+        return _total(self._each("logprob", logits, actions))
 
     def entropy(self, logits: Tree) -> torch.Tensor:
         """Returns the entropy (...,) in nats."""
-        return _total(self._each("entropy", logits).values())
+        return _total(self._each("entropy", logits))
 
     def action_value(self, logits: Tree, actions: Tree) -> torch.Tensor:
         """Returns the value (...,) of actions."""
-        return _total(self._each("action_value", logits, actions).values())
+        return _total(self._each("action_value", logits, actions))
 
 
-def _total(parts: Iterable[torch.Tensor]) -> torch.Tensor:
-    return typing.cast(torch.Tensor, sum(parts))  # there is at least one
+def _total(parts: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    return typing.cast(torch.Tensor, sum(parts.values()))  # there is at least one

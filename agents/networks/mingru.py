@@ -28,7 +28,6 @@ from megastep.agents.networks.fused import (
     aligned,
     check_shapes,
     fused,
-    launch_units,
 )
 from megastep.agents.networks.linear import (
     cast,
@@ -51,12 +50,16 @@ def _split(gates) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _forward_on_gpu(gates, reset, start, residual=None, has_states=False) -> tuple:
-    outputs, last = gates.new_empty(*reset.shape, start.shape[1]), torch.empty_like(start)
+    n_lanes, width = start.shape
+    n_units = 1 if width % 4 else 4  # neighbours of a lane, that a thread has
+    outputs, last = gates.new_empty(*reset.shape, width), torch.empty_like(start)
     states = torch.empty_like(outputs) if has_states else None
-    launch_units(
-        *("mingru_forward", gates.dtype, start),
+    operation, n_threads = f"mingru_forward_{DTYPES[gates.dtype]}", start.numel() // n_units
+    launch(
+        *(LIBRARY, operation, start.device, n_threads),
         **dict(gates=gates, reset=reset, start=start, residual=residual),
         **dict(states=states, outputs=outputs, last=last, n_steps=len(gates)),
+        **dict(n_lanes=n_lanes, width=width, n_units=n_units),
     )
     return outputs, last, states
 

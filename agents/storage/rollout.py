@@ -280,11 +280,7 @@ def bytes_per_step(env: Env, policy: Policy) -> int:
 
 def copy_tree(target: Tree, source: Tree) -> None:
     """Copies the tensors of a tree into those of another with the same keys, on any device."""
-    if isinstance(target, torch.Tensor):
-        target.copy_(source)
-        return
-    for key, part in target.items():
-        copy_tree(part, source[key])
+    spaces.map(torch.Tensor.copy_, target, source)
 
 
 def without_last(tree: Tree) -> Tree:

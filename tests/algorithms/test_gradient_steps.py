@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from megastep.agents.algorithms.gradient_steps import GradientSteps
-from megastep.agents.algorithms.optimizers import Adam, has_kernels
+from megastep.agents.algorithms.optimizers import BETAS, EPS, Adam, has_kernels
 
 
 def updates(to=torch.Tensor.cpu):
@@ -117,9 +117,8 @@ def test_matches_torch_optim_adamw(device):
     """Only the matrix decays, and the vector has three times the step size."""
     params, torch_params = parameters(device), parameters(device)
     lr = torch.tensor(0.1, device=device)
-    options = dict(betas=(0.8, 0.99), eps=1e-4)
-    adam = Adam(params, lr, lr_factors={params[1]: 3.0}, weight_decays={params[0]: 0.5}, **options)
-    options |= dict(fused=True, capturable=device == "cuda")
+    adam = Adam(params, lr, lr_factors={params[1]: 3.0}, weight_decays={params[0]: 0.5})
+    options = dict(betas=BETAS, eps=EPS, fused=True, capturable=device == "cuda")
     torch_adams = [
         torch.optim.AdamW([p], lr=lr.clone(), weight_decay=decay, **options)
         for p, decay in zip(torch_params, (0.5, 0.0, 0.0))

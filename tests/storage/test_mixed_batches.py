@@ -4,11 +4,10 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.algorithms import vtrace
+from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings
 from megastep.agents.storage.rollout import Rollout
-from megastep.arrdict import arrdict
 
 T, B = 4, 3
 OBS, MOVES = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 60)
@@ -32,15 +31,14 @@ def rollouts(policy, n):
 
 def batch_of(n_rollouts, n=5, burn_in=0, **settings):
     policy = Policy(OBS, MOVES, PRIVILEGED, width=8)
-    settings = ReplaySettings(capacity=4 * T * B, burn_in=burn_in, **settings)
+    ratio = n / len(LANES)
+    settings = ReplaySettings(capacity=4 * T * B, burn_in=burn_in, ratio=ratio, **settings)
+    learner = VTrace(policy, buffer="replay", replay=settings)
     for i, rollout in enumerate(rollouts(policy, n_rollouts)):
         if i == 0:
-            replay = ReplayBuffer(rollout, settings)
-        replay.add(rollout)
-    generator = torch.Generator().manual_seed(1)
-    batch = rollout.sequences(LANES)
-    batch = arrdict(batch, weight=torch.ones(2), age=torch.zeros_like(LANES))
-    return policy, replay, rollout, vtrace.with_replayed(batch, replay, policy, n, generator)
+            learner.replay_buffer = ReplayBuffer(rollout, settings)
+        learner.replay_buffer.add(rollout)
+    return policy, learner.replay_buffer, rollout, learner._batch(rollout, LANES)
 
 
 @pytest.mark.parametrize("burn_in", [0, 2])
