@@ -63,7 +63,7 @@ static void step(const PhysicsParams& p, int env, std::vector<unsigned char>& me
 
 KERNEL physics(const PhysicsParams& p) {
     const SceneryParams& s = p.scenery;
-    int n_threads = threads_for(s, s.n_envs * s.n_agents, MIN_PARALLEL);
+    int n_threads = threads_for_agents(s, MIN_PARALLEL);
 #pragma omp parallel num_threads(n_threads)
     {
         std::vector<unsigned char> meets;

@@ -213,13 +213,6 @@ HD int passes_slot(int elevated, int slot, int n_agents) {
     return slot >= n_agents && (elevated > 0 || elevated == n_agents - 1 - slot);
 }
 
-// Appends to a list what those threads of a group have that have something, in the order of their
-// ranks. Returns the index of this thread's.
-HD int append(const SingleThread&, int has, int& n) { return has ? n++ : -1; }
-
-// A bit for each thread of a group, set where `is_set`.
-HD unsigned int ballot(const SingleThread&, int is_set) { return is_set ? 1u : 0u; }
-
 // Lists `candidate` if this thread has one. If the list is full, its slots do not move in this
 // step.
 template <class Group>

@@ -136,3 +136,14 @@ HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
     if (moves && group.rank == 0)
         s.layout[env] = layout;
 }
+
+// Agents, few of which respawn: a GPU has a thread per environment. Where points are to be hidden
+// it has a warp, each thread of which tests one wall at a time.
+EACH(spawn, SpawnParams, p.scenery.n_envs, threads_for_agents(p.scenery, 1 << 14),
+     spawn_env<0, 0>(p, SingleThread{0}, i))
+EACH(spawn_objects, SpawnParams, p.scenery.n_envs, threads_for_agents(p.scenery, 1 << 14),
+     spawn_env<0, 1>(p, SingleThread{0}, i))
+EACH_WARP(spawn_hidden, SpawnParams, p.scenery.n_envs, p.scenery.n_threads,
+          spawn_env<1, 0>(p, group, i))
+EACH_WARP(spawn_hidden_objects, SpawnParams, p.scenery.n_envs, p.scenery.n_threads,
+          spawn_env<1, 1>(p, group, i))

@@ -33,15 +33,8 @@ SCHEDULES = ("forward", False), ("reversed", True), ("shuffled", False), ("shuff
 #: Kernels that give the CPU's bits have the CPU's half of backend.h here.
 BACKEND = """
 #undef KERNEL
+#define HAS_THREADS
 #include "common/backend.h"
-#undef EACH
-#define EACH(operation, Params, count, threads, statement) \\
-    KERNEL operation(Params p) { \\
-        wait_for_previous(); \\
-        int n = count, i = blockIdx.x * blockDim.x + threadIdx.x; \\
-        if (i < n) \\
-            statement; \\
-    }
 #define BOUNDS(n_blocks)
 #define PREFETCH(address)
 constexpr unsigned int FULL_WARP = ~0u;

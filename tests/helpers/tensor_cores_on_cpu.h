@@ -10,6 +10,8 @@
 
 // ---- Numbers ----
 
+typedef unsigned short Bits;
+
 DEVICE float low_half(unsigned int pair) { return __uint_as_float(pair << 16); }
 
 DEVICE float high_half(unsigned int pair) { return __uint_as_float(pair & 0xffff0000u); }

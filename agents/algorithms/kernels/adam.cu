@@ -1,12 +1,9 @@
 // Adam with decoupled weight decay for many parameters in one launch, the norm of their gradients,
 // and whether a step is taken. A block handles neighbouring numbers of one parameter, a thread a
 // word of four.
-#include "common/constants.h"
 #include "common/rows.h"
-#include "constants.h"
+#include "common/sums.h"
 #include "params.h"
-
-#define BOUNDS(n_threads) __launch_bounds__(n_threads)
 
 static_assert(sizeof(AdamParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
 static_assert(sizeof(SquaredNormParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
@@ -37,7 +34,6 @@ DEVICE void read(float (&values)[4], const float* array, const WordIndex& index)
         values[3] = word.w;
         return;
     }
-#pragma unroll
     for (int i = 0; i < 4; i++)
         values[i] = i < index.n ? array[index.first + i] : 0.f;
 }
@@ -47,46 +43,32 @@ DEVICE void write(float* array, const WordIndex& index, const float (&values)[4]
         *(float4*)(array + index.first) = make_float4(values[0], values[1], values[2], values[3]);
         return;
     }
-#pragma unroll
     for (int i = 0; i < 4; i++)
         if (i < index.n)
             array[index.first + i] = values[i];
 }
 
-// The sum over a block in a fixed order, for its first thread.
-DEVICE float sum_of_block(float x) {
-    for (int mask = WARP / 2; mask; mask /= 2)
-        x += __shfl_xor_sync(~0u, x, mask);
-    __shared__ float of_warps[ADAM_THREADS / WARP];
-    if (threadIdx.x % WARP == 0)
-        of_warps[threadIdx.x / WARP] = x;
-    __syncthreads();
-    float sum = 0.f;
-    for (int warp = 0; warp < ADAM_THREADS / WARP; warp++)
-        sum += of_warps[warp];
-    return sum;
-}
-
-KERNEL BOUNDS(256) squared_norm(SquaredNormParams p) {
+KERNEL __launch_bounds__(256) squared_norm(SquaredNormParams p) {
     wait_for_previous();
     WordIndex index = find_index(p.rows, p.n_rows);
-    float values[4], sum = 0.f;
+    float values[4], sum[1] = {};
     read(values, p.rows[index.row].gradient, index);
     for (int i = 0; i < 4; i++)
-        sum += values[i] * values[i];
-    sum = sum_of_block(sum);
-    if (!threadIdx.x)
-        p.sums[p.first_sum + blockIdx.x] = sum;
+        sum[0] += values[i] * values[i];
+    add_up<ADAM_THREADS>(sum, p.sums + p.first_sum + blockIdx.x);
 }
 
 // One block. Decides whether a step is taken, and counts it and its metrics.
-KERNEL BOUNDS(256) judge(JudgeParams p) {
+KERNEL __launch_bounds__(256) judge(JudgeParams p) {
     wait_for_previous();
     int n_totals = p.n_metrics + 3;
-    float sum = 0.f;
+    __shared__ float total;
+    float sum[1] = {};
     for (int i = threadIdx.x; i < p.n_sums; i += ADAM_THREADS)
-        sum += p.sums[i];
-    float grad_norm = sqrtf(sum_of_block(sum));
+        sum[0] += p.sums[i];
+    add_up<ADAM_THREADS>(sum, &total);
+    __syncthreads();
+    float grad_norm = sqrtf(total);
     bool is_finite = isfinite(grad_norm) && *p.is_finite;
     bool is_enabled = !p.is_enabled || *p.is_enabled;
     bool is_taken = is_finite && is_enabled && *p.n_valid > 0;
@@ -106,7 +88,7 @@ KERNEL BOUNDS(256) judge(JudgeParams p) {
     *p.n_steps += is_taken ? 1.f : 0.f;
 }
 
-KERNEL BOUNDS(256) adam(AdamParams p) {
+KERNEL __launch_bounds__(256) adam(AdamParams p) {
     wait_for_previous();
     if (!*p.is_taken)
         return;
@@ -121,7 +103,6 @@ KERNEL BOUNDS(256) adam(AdamParams p) {
     float lr = *p.lr * row.lr_factor, n_steps = *p.n_steps;
     float step = lr / (1.f - powf(p.beta1, n_steps));
     float scale = 1.f / sqrtf(1.f - powf(p.beta2, n_steps));
-#pragma unroll
     for (int i = 0; i < 4; i++) {
         float gradient = gradients[i] * clip;
         means[i] += (1.f - p.beta1) * (gradient - means[i]);

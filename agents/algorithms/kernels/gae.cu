@@ -1,5 +1,4 @@
 // Generalised advantage estimates, one thread per lane, from the last step to the first.
-#include "common/constants.h"
 #include "common/dependent_launch.h"
 #include "params.h"
 

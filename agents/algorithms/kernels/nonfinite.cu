@@ -1,10 +1,6 @@
 // Looks for numbers of a rollout that are NaN, infinite or too large.
-#include "common/constants.h"
 #include "common/dependent_launch.h"
-#include "constants.h"
 #include "params.h"
-
-#define BOUNDS(n_threads) __launch_bounds__(n_threads)
 
 static_assert(sizeof(FindBadParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
 static_assert(sizeof(RecordParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
@@ -12,9 +8,7 @@ static_assert(sizeof(RecordParams::tensors) == CHECKED_TENSORS * sizeof(CheckedT
 DEVICE float value_at(const CheckedTensorParams& tensor, long long at) {
     if (!tensor.is_half)
         return ((const float*)tensor.values)[at];
-    float x;
-    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(((const unsigned short*)tensor.values)[at]));
-    return x;
+    return half_value(((const unsigned short*)tensor.values)[at]);
 }
 
 // Whether a word has a bad number: two float16 or one float32. A float16 is bad if all bits of its
@@ -34,7 +28,7 @@ DEVICE void keep(const FindBadParams& p, int of_tensor, long long at) {
 }
 
 // A thread reads CHECKED_WORDS words of 16 bytes, a block neighbouring ones of one tensor.
-KERNEL BOUNDS(256) find_bad(FindBadParams p) {
+KERNEL __launch_bounds__(256) find_bad(FindBadParams p) {
     wait_for_previous();
     int i = 0;
     while (i + 1 < p.n_tensors && p.tensors[i + 1].first_block <= blockIdx.x)
@@ -48,7 +42,6 @@ KERNEL BOUNDS(256) find_bad(FindBadParams p) {
     long long n_numbers = (long long)tensor.n_steps * p.n_lanes * tensor.n_features;
     long long n_words = n_numbers / per_word;
     uint4 words[CHECKED_WORDS];
-#pragma unroll
     for (int n = 0; n < CHECKED_WORDS; n++) {
         long long at = first_word + n * CHECKED_THREADS + threadIdx.x;
         words[n] = at < n_words ? ((const uint4*)tensor.values)[at] : make_uint4(0, 0, 0, 0);
@@ -83,7 +76,7 @@ DEVICE float size_of(const CheckedTensorParams& tensor, long long row) {
 
 // One block. Counts the rollout, and keeps its first bad number, that of the smallest row and lane,
 // unless an earlier rollout's is still there.
-KERNEL BOUNDS(1024) record(RecordParams p) {
+KERNEL __launch_bounds__(1024) record(RecordParams p) {
     wait_for_previous();
     __shared__ unsigned long long first;
     __shared__ int n_bad;

@@ -1,7 +1,6 @@
 // PPO's loss, with its gradients and metrics, all means over valid rows. One thread per row; a
 // block adds up its rows in a fixed order, the caller the blocks.
-#include "block_sums.h"
-#include "constants.h"
+#include "common/sums.h"
 #include "params.h"
 
 KERNEL ppo_loss(PpoLossParams p) {

@@ -1,7 +1,6 @@
 // R2D2's loss with its gradient, priorities and metrics. A block handles a few sequences, a thread
 // every N-th step of one of them; the block adds up in a fixed order.
-#include "block_sums.h"
-#include "constants.h"
+#include "common/sums.h"
 #include "params.h"
 
 constexpr int PHASES = TD_THREADS / TD_SEQUENCES;  // threads of a sequence
@@ -120,8 +119,7 @@ KERNEL td_metrics(TdMetricsParams p) {
         float sum = 0.f;
         for (int block = lane; block < p.n_blocks; block += WARP)
             sum += p.sums[block * N_TD_SUMS + warp];
-        for (int mask = WARP / 2; mask; mask /= 2)
-            sum += __shfl_xor_sync(~0u, sum, mask);
+        sum = sum_of_threads(sum);
         if (!lane)
             totals[warp] = sum;
     }

@@ -1,12 +1,9 @@
 // The gradient of a layer before its activation (ReLU), and its sums over rows, which are the
 // gradient of the bias. A block adds up a strip of rows in a fixed order; the caller adds the
 // strips. Blocks along y: words of columns, 32 at once.
-#include "constants.h"
-#include "lanes.h"
-#include "params.h"
 #include "strips.h"
 
-KERNEL BOUNDS(256) bias_gradient(BiasGradientParams p) {
+KERNEL __launch_bounds__(256) bias_gradient(BiasGradientParams p) {
     wait_for_previous();
     constexpr int N = 8;                                            // columns that a thread handles
     int n_words = p.n_columns / N, first_word = WARP * blockIdx.y;  // of a row
@@ -16,14 +13,12 @@ KERNEL BOUNDS(256) bias_gradient(BiasGradientParams p) {
     clear(sums);
     for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
         float values[AT_ONCE][N], activated[AT_ONCE][N];
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
             long long row = min(start + i * strip.step, strip.end - 1);
             read<Bfloat16>(values[i], p.d, row * p.d_stride + word * N);
             if (p.activated)
                 read<Bfloat16>(activated[i], p.activated, row * p.n_columns + word * N);
         }
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
             long long row = start + i * strip.step;
             if (row >= strip.end)
@@ -42,7 +37,7 @@ KERNEL BOUNDS(256) bias_gradient(BiasGradientParams p) {
 }
 
 // Adds up rows in a fixed order. A warp handles 32 columns of every eighth row.
-KERNEL BOUNDS(256) sum_rows(SumRowsParams p) {
+KERNEL __launch_bounds__(256) sum_rows(SumRowsParams p) {
     wait_for_previous();
     constexpr int WARPS = STRIP_THREADS / WARP;
     __shared__ float of_warps[WARPS][WARP];

@@ -1,13 +1,12 @@
 // Rounds weights to bfloat16, many in one launch, with zeros after each. A thread writes a word of
 // eight numbers.
 #include "common/rows.h"
-#include "constants.h"
-#include "lanes.h"
+#include "number.h"
 #include "params.h"
 
 static_assert(sizeof(CastParams::rows) == CAST_ROWS * sizeof(CastRowParams));
 
-KERNEL BOUNDS(256) cast(CastParams p) {
+KERNEL __launch_bounds__(256) cast(CastParams p) {
     wait_for_previous();
     const CastRowParams& its = p.rows[row_of_block(p.rows, p.n_rows)];
     unsigned int at = 8 * ((blockIdx.x - its.first_block) * CAST_THREADS + threadIdx.x);
@@ -18,11 +17,9 @@ KERNEL BOUNDS(256) cast(CastParams p) {
     if (at + 8 <= its.n && (unsigned long long)source % 16 == 0) {
         uint4 low = *(const uint4*)source, high = *(const uint4*)(source + 4);
         const unsigned int words[8] = {low.x, low.y, low.z, low.w, high.x, high.y, high.z, high.w};
-#pragma unroll
         for (int i = 0; i < 8; i++)
             values[i] = __uint_as_float(words[i]);
     } else
-#pragma unroll
         for (int i = 0; i < 8; i++)
             values[i] = at + i < its.n ? source[i] : 0.f;
     write<Bfloat16>(its.target, at, values);

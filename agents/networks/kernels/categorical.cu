@@ -1,6 +1,6 @@
 // Choosing categorical actions, ACT_THREADS threads per lane.
-#include "constants.h"
-#include "lanes.h"
+#include "common/sums.h"
+#include "number.h"
 #include "params.h"
 
 template <class T>
@@ -16,12 +16,6 @@ DEVICE float largest_of_lane(float x) {
     return x;
 }
 
-DEVICE float sum_of_lane(float x) {
-    for (int mask = ACT_THREADS / 2; mask; mask /= 2)
-        x += __shfl_xor_sync(~0u, x, mask);
-    return x;
-}
-
 // The score of choice `part` of an agent, before the bias. The threads of a lane share its
 // features. Nothing branches on the number of choices, so that no load waits for another.
 template <class T>
@@ -31,19 +25,16 @@ DEVICE float score_of(const CategoricalActParams& p, const T* features, const T*
     for (int first = N * part; first < p.width; first += N * ACT_THREADS) {
         float of_lane[N];
         read<T>(of_lane, features, first);
-#pragma unroll
         for (int k = 0; k < ACT_THREADS; k++) {
             float weights[N];
             read<T>(weights, weight, min(k, p.n_choices - 1) * p.width + first);
-#pragma unroll
             for (int n = 0; n < N; n++)
                 sums[k] += of_lane[n] * weights[n];
         }
     }
     float score = 0.f;
-#pragma unroll
     for (int k = 0; k < ACT_THREADS; k++) {
-        float sum = sum_of_lane(sums[k]);
+        float sum = sum_of_threads<ACT_THREADS>(sums[k]);
         score = k == part ? sum : score;
     }
     return score;
@@ -67,7 +58,7 @@ DEVICE void act(const CategoricalActParams& p) {
                                (const T*)p.weight + (long long)choice * p.width, part);
         score = is_choice ? rounded<T>(score + bias) : -infinity;
         float largest = largest_of_lane(score);
-        float total = sum_of_lane(is_choice ? expf(score - largest) : 0.f);
+        float total = sum_of_threads<ACT_THREADS>(is_choice ? expf(score - largest) : 0.f);
         float logit = score - largest - logf(total);
         float value = logit - logf(fmaxf(noise, 1e-20f));
         if (is_choice)
@@ -85,5 +76,5 @@ DEVICE void act(const CategoricalActParams& p) {
         p.logprobs[row] = logprob;
 }
 
-INSTANCE(BOUNDS(64) categorical_act_float32, CategoricalActParams, act<float>)
-INSTANCE(BOUNDS(64) categorical_act_bfloat16, CategoricalActParams, act<Bfloat16>)
+INSTANCE(__launch_bounds__(64) categorical_act_float32, CategoricalActParams, act<float>)
+INSTANCE(__launch_bounds__(64) categorical_act_bfloat16, CategoricalActParams, act<Bfloat16>)

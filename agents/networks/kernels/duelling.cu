@@ -1,8 +1,7 @@
 // Action values of a duelling network from its hidden layer (features of the value, then those of
 // the advantages), their gradients, and epsilon-greedy actions. An agent's value is the lane's
 // value plus its advantage minus the mean over the choices.
-#include "constants.h"
-#include "lanes.h"
+#include "number.h"
 #include "params.h"
 
 constexpr int OUTPUTS = DUELLING_OUTPUTS;   // at most, A n
@@ -15,7 +14,6 @@ constexpr int N = 16 / sizeof(Bfloat16);    // numbers that a thread reads at on
 // Sums over the warp: thread i returns that of sums[i].
 DEVICE float sum_of_own(float (&sums)[WARP]) {
     int lane = threadIdx.x % WARP;
-#pragma unroll
     for (int half = WARP / 2; half; half /= 2)
 #pragma unroll
         for (int i = 0; i < half; i++) {
@@ -27,16 +25,6 @@ DEVICE float sum_of_own(float (&sums)[WARP]) {
     return sums[0];
 }
 
-DEVICE void read_floats(float (&values)[N], const float* address) {
-#pragma unroll
-    for (int n = 0; n < N; n += 4) {
-        float four[4];
-        read<float>(four, address, n);
-        for (int i = 0; i < 4; i++)
-            values[n + i] = four[i];
-    }
-}
-
 // The products of half of the hidden layer, from `offset`, with `n_outputs` rows of a weight.
 // Thread OUTPUTS i + k returns that of row i and output k.
 DEVICE float products(const DuellingParams& p, const long long (&rows)[ROWS], int offset,
@@ -44,17 +32,14 @@ DEVICE float products(const DuellingParams& p, const long long (&rows)[ROWS], in
     float sums[WARP] = {};
     for (int first = N * (threadIdx.x % WARP); first < p.width; first += N * WARP) {
         float hidden[ROWS][N];
-#pragma unroll
         for (int i = 0; i < ROWS; i++)
             read<Bfloat16>(hidden[i], p.hidden, rows[i] * (2 * p.width) + offset + first);
 #pragma unroll
         for (int k = 0; k < OUTPUTS; k++)
             if (k < n_outputs) {
                 float weights[N];
-                read_floats(weights, weight + k * p.width + first);
-#pragma unroll
+                read_eight(weights, weight + k * p.width + first);
                 for (int i = 0; i < ROWS; i++)
-#pragma unroll
                     for (int n = 0; n < N; n++)
                         sums[OUTPUTS * i + k] += hidden[i][n] * weights[n];
             }
@@ -73,7 +58,6 @@ DEVICE Part find_part(const DuellingParams& p) {
     int lane = threadIdx.x % WARP, n_outputs = p.n_agents * p.n_choices;
     int first = (blockIdx.x * blockDim.x + threadIdx.x) / WARP * ROWS;
     Part part;
-#pragma unroll
     for (int i = 0; i < ROWS; i++)
         part.rows[i] = min(first + i, p.n_rows - 1);
     part.row = first + lane / OUTPUTS;
@@ -91,7 +75,6 @@ DEVICE float value_of(const DuellingParams& p, const Part& me) {
     advantage += p.advantage_bias[min(me.part, last)];
     value = __shfl_sync(~0u, value, me.agent, OUTPUTS) + p.value_bias[me.agent];
     float sum = 0.f;
-#pragma unroll
     for (int k = 0; k < OUTPUTS; k++) {
         float other = __shfl_sync(~0u, advantage, k, OUTPUTS);
         sum += k / p.n_choices == me.agent && k < n_outputs ? other : 0.f;
@@ -102,17 +85,16 @@ DEVICE float value_of(const DuellingParams& p, const Part& me) {
     return value;
 }
 
-KERNEL BOUNDS(64) duelling_values(DuellingParams p) {
+KERNEL __launch_bounds__(64) duelling_values(DuellingParams p) {
     wait_for_previous();
     value_of(p, find_part(p));
 }
 
-KERNEL BOUNDS(64) duelling_act(DuellingParams p) {
+KERNEL __launch_bounds__(64) duelling_act(DuellingParams p) {
     wait_for_previous();
     Part me = find_part(p);
     float value = value_of(p, me), best_value = 0.f, logprob = 0.f;
     int best = -1, n_outputs = p.n_agents * p.n_choices, agent = me.agent;
-#pragma unroll
     for (int k = 0; k < OUTPUTS; k++) {  // the first of the best choices of this thread's agent
         float other = __shfl_sync(~0u, value, k, OUTPUTS);
         if (k / p.n_choices == agent && k < n_outputs && (best < 0 || other > best_value)) {
@@ -133,7 +115,6 @@ KERNEL BOUNDS(64) duelling_act(DuellingParams p) {
     float chance = p.usual_epsilon / (float)p.n_choices;
     chance += action == best ? 1.f - p.usual_epsilon : 0.f;
     float own = is_first ? logf(chance) : 0.f;
-#pragma unroll
     for (int k = 0; k < OUTPUTS; k++)
         logprob += __shfl_sync(~0u, own, k, OUTPUTS);
     if (me.exists && !me.part)
@@ -156,7 +137,6 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
     constexpr int AT_ONCE = 8;  // rows whose loads do not wait
     float weights[K][2], d_weights[K][2], sums[2] = {};
     int in_half = column % p.width;
-#pragma unroll
     for (int k = 0; k < K; k++) {
         clear(d_weights[k]);
         clear(weights[k]);
@@ -167,25 +147,20 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
     int n_rows = min(STRIP_ROWS, p.n_rows - (int)blockIdx.x * STRIP_ROWS);
     for (int start = 0; start < n_rows; start += AT_ONCE) {
         float hidden[AT_ONCE][2];
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++)
             read<Bfloat16>(hidden[i], p.hidden,
                            (first + min(start + i, n_rows - 1)) * (2 * p.width) + column);
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
             if (start + i >= n_rows)
                 break;
             const RowGradient& row = gradients[start + i];
             const float* d = is_value ? row.value : row.advantage;
             float d_hidden[2] = {};
-#pragma unroll
             for (int k = 0; k < K; k++)
-#pragma unroll
                 for (int n = 0; n < 2; n++) {
                     d_hidden[n] += d[k] * weights[k][n];
                     d_weights[k][n] += d[k] * hidden[i][n];
                 }
-#pragma unroll
             for (int n = 0; n < 2; n++) {
                 d_hidden[n] = hidden[i][n] <= 0.f ? 0.f : d_hidden[n];
                 sums[n] += d_hidden[n];
@@ -193,10 +168,8 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
             write<Bfloat16>(p.d_hidden, (first + start + i) * (2 * p.width) + column, d_hidden);
         }
     }
-#pragma unroll
     for (int n = 0; n < 2; n++) {
         d_bias[column + n] = sums[n];
-#pragma unroll
         for (int k = 0; k < K; k++)
             if (k < n_outputs)
                 d_weight[(long long)k * p.width + in_half + n] = d_weights[k][n];
@@ -206,7 +179,7 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
 // A block handles a strip of rows and up to 2 DUELLING_THREADS columns; blocks along y: the parts
 // of the columns. A strip's sums are those of the hidden layer's bias, the weights
 // of value and advantages, and their biases, in this order.
-KERNEL BOUNDS(256) duelling_backward(DuellingBackwardParams p) {
+KERNEL __launch_bounds__(256) duelling_backward(DuellingBackwardParams p) {
     wait_for_previous();
     __shared__ RowGradient gradients[STRIP_ROWS];
     int n_outputs = p.n_agents * p.n_choices, strip = blockIdx.x;
@@ -215,19 +188,15 @@ KERNEL BOUNDS(256) duelling_backward(DuellingBackwardParams p) {
     for (int i = threadIdx.x; i < STRIP_ROWS; i += DUELLING_THREADS) {
         RowGradient gradient = {};
         if (i < n_rows)
-#pragma unroll
             for (int k = 0; k < OUTPUTS; k++) {
                 if (k >= n_outputs)
                     break;
                 float d = p.d_values[(first + i) * n_outputs + k];
                 gradient.advantage[k] = d;
-#pragma unroll
                 for (int agent = 0; agent < OUTPUTS; agent++)
                     gradient.value[agent] += k / p.n_choices == agent ? d : 0.f;
             }
-#pragma unroll
         for (int k = 0; k < OUTPUTS; k++)
-#pragma unroll
             for (int agent = 0; agent < OUTPUTS; agent++)
                 if (k < n_outputs && k / p.n_choices == agent)
                     gradient.advantage[k] -= gradient.value[agent] / (float)p.n_choices;

@@ -4,29 +4,17 @@
 // actions, and the critic's hidden layer before its ReLU, each padded to a multiple of 8. A plain
 // critic, whose last layer has no weight here, has its value in place of that layer. Blocks are
 // strips of rows.
-#include "constants.h"
-#include "lanes.h"
-#include "params.h"
+#include "common/sums.h"
 #include "strips.h"
 
 constexpr int WORD = 8;  // bfloat16 numbers that a thread reads at once
 
 DEVICE int padded(int n) { return (n + WORD - 1) / WORD * WORD; }
 
-DEVICE void read_word(float (&values)[WORD], const float* from) {
-    float first[4], last[4];
-    read<float>(first, from, 0);
-    read<float>(last, from, 4);
-    for (int n = 0; n < 4; n++) {
-        values[n] = first[n];
-        values[4 + n] = last[n];
-    }
-}
-
 // The weights of the value of a word of hidden units, or of the word with a plain critic's value.
 DEVICE void read_value_weight(float (&weight)[WORD], const float* from, int column) {
     if (from)
-        return read_word(weight, from + column);
+        return read_eight(weight, from + column);
     for (int n = 0; n < WORD; n++)
         weight[n] = column || n ? 0.f : 1.f;
 }
@@ -60,14 +48,8 @@ DEVICE Softmax softmax_of(const Bfloat16* scores, int n) {
     return softmax;
 }
 
-DEVICE float sum_of_eight(float x) {
-    for (int mask = 4; mask; mask /= 2)
-        x += __shfl_xor_sync(~0u, x, mask);
-    return x;
-}
-
 // One thread per row for the actions; eight threads per row for the rest.
-KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
+KERNEL __launch_bounds__(256) heads_forward(HeadsForwardParams p) {
     wait_for_previous();
     int start = (int)blockIdx.x * STRIP;
     int first_score = padded(p.n_predicted);
@@ -111,8 +93,8 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
                 error += column + n < p.n_predicted ? difference * difference : 0.f;
             }
         }
-        value = sum_of_eight(value);
-        error = sum_of_eight(error);
+        value = sum_of_threads<8>(value);
+        error = sum_of_threads<8>(error);
         if (part || start + i >= p.n_rows)
             continue;
         value += p.value_bias ? *p.value_bias : 0.f;
@@ -168,7 +150,6 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
         clear(sums);
         for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
             float values[AT_ONCE][WORD], expected[AT_ONCE][WORD], d_errors[AT_ONCE];
-#pragma unroll
             for (int i = 0; i < AT_ONCE; i++) {
                 long long row = min(start + i * strip.step, strip.end - 1);
                 long long at = row * index.n_columns + column;
@@ -180,7 +161,6 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
                 d_errors[i] =
                     index.first_score ? p.d_errors[row] * 2.f / (float)p.n_predicted : 0.f;
             }
-#pragma unroll
             for (int i = 0; i < AT_ONCE; i++) {
                 int row = start + i * strip.step;
                 if (row >= strip.end)
@@ -214,14 +194,12 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     float scale = *p.value_scale;
     for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
         float hidden[AT_ONCE][WORD], d_values[AT_ONCE];
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
             long long row = min(start + i * strip.step, strip.end - 1);
             read<Bfloat16>(hidden[i], p.product,
                            row * index.n_columns + index.first_hidden + column);
             d_values[i] = p.d_values[row] * scale;
         }
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
             int row = start + i * strip.step;
             if (row >= strip.end)
@@ -248,7 +226,7 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
 }
 
 // Neighbouring blocks have one strip: one has prediction and scores, the others the hidden layer.
-KERNEL BOUNDS(256) heads_backward(HeadsBackwardParams p) {
+KERNEL __launch_bounds__(256) heads_backward(HeadsBackwardParams p) {
     wait_for_previous();
     int n_parts = 1 + (p.width / WORD + WARP - 1) / WARP, part = blockIdx.x % n_parts;
     HeadsIndex index;

@@ -6,10 +6,30 @@
 // that steps do not wait for GPU memory. Loads have no conditions and come last in a step:
 // otherwise the compiler would copy what they load, and so wait for it. The last steps' loads are
 // not used.
-#include "lanes.h"
+#include "number.h"
 #include "params.h"
 
 constexpr int STEPS_AHEAD = 4;
+
+// A thread's lane, and the offsets of its units in an array (B, W) and in the update gates of an
+// array (B, 2 W).
+struct UnitIndex {
+    int lane;
+    long long unit, gate;
+};
+
+template <class Params>
+DEVICE bool find_index(const Params& p, UnitIndex& index) {
+    unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x;
+    unsigned int threads_per_lane = p.width / p.n_units;
+    unsigned int lane = thread / threads_per_lane;
+    long long first = thread % threads_per_lane * p.n_units, row = (long long)lane * p.width;
+    index = {(int)lane, row + first, 2 * row + first};
+    return lane < (unsigned int)p.n_lanes;
+}
+
+// For large |x| the exponential is 0 or infinite and the quotient 1 or 0. NaN stays NaN.
+DEVICE float sigmoid(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
 
 template <class T, int N>
 struct MingruGates {
@@ -50,51 +70,45 @@ DEVICE void load(MingruForwardInput<T, N>& input, const MingruForwardParams& p,
         load(input.residual, p.residual, unit_at(p, index, t));
 }
 
-struct MingruForward {
-    static constexpr int N_GATES = 2;
-
-    template <class T, int N>
-    DEVICE void run(const MingruForwardParams& p, const UnitIndex& index) {
-        int n_steps = p.n_steps;
-        float state[N];
-        MingruForwardInput<T, N> inputs[STEPS_AHEAD];
-#pragma unroll
-        for (int i = 0; i < STEPS_AHEAD; i++)
-            load(inputs[i], p, index, min(i, n_steps - 1));
-        read<float>(state, p.start, index.unit);
-        for (int first = 0; first < n_steps; first += STEPS_AHEAD) {
-#pragma unroll
-            for (int i = 0; i < STEPS_AHEAD; i++) {
-                int t = first + i;
-                if (t >= n_steps)
-                    break;
-                step(p, unit_at(p, index, t), inputs[i], state);
-                load(inputs[i], p, index, min(t + STEPS_AHEAD, n_steps - 1));
-            }
-        }
-        write<float>(p.last, index.unit, state);
+template <class T, int N>
+DEVICE void forward_step(const MingruForwardParams& p, long long unit,
+                         const MingruForwardInput<T, N>& input, float (&state)[N]) {
+    float update[N], candidate[N], output[N];
+    unpack(update, input.gates.update);
+    unpack(candidate, input.gates.candidate);
+    if (input.gates.reset)
+        clear(state);
+    clear(output);
+    if (p.residual)
+        unpack(output, input.residual);
+    for (int n = 0; n < N; n++) {
+        state[n] += sigmoid(update[n]) * (candidate[n] - state[n]);
+        output[n] += state[n];
     }
+    write<T>(p.outputs, unit, output);
+    if (p.states)
+        write<T>(p.states, unit, state);
+}
 
-    template <class T, int N>
-    DEVICE void step(const MingruForwardParams& p, long long unit,
-                     const MingruForwardInput<T, N>& input, float (&state)[N]) {
-        float update[N], candidate[N], output[N];
-        unpack(update, input.gates.update);
-        unpack(candidate, input.gates.candidate);
-        if (input.gates.reset)
-            clear(state);
-        clear(output);
-        if (p.residual)
-            unpack(output, input.residual);
-        for (int n = 0; n < N; n++) {
-            state[n] += sigmoid(update[n]) * (candidate[n] - state[n]);
-            output[n] += state[n];
+template <class T, int N>
+DEVICE void forward(const MingruForwardParams& p, const UnitIndex& index) {
+    int n_steps = p.n_steps;
+    float state[N];
+    MingruForwardInput<T, N> inputs[STEPS_AHEAD];
+    for (int i = 0; i < STEPS_AHEAD; i++)
+        load(inputs[i], p, index, min(i, n_steps - 1));
+    read<float>(state, p.start, index.unit);
+    for (int first = 0; first < n_steps; first += STEPS_AHEAD) {
+        for (int i = 0; i < STEPS_AHEAD; i++) {
+            int t = first + i;
+            if (t >= n_steps)
+                break;
+            forward_step(p, unit_at(p, index, t), inputs[i], state);
+            load(inputs[i], p, index, min(t + STEPS_AHEAD, n_steps - 1));
         }
-        write<T>(p.outputs, unit, output);
-        if (p.states)
-            write<T>(p.states, unit, state);
     }
-};
+    write<float>(p.last, index.unit, state);
+}
 
 // The inputs of a backward step: also the state before it, and the gradient of its output.
 template <class T, int N>
@@ -150,7 +164,6 @@ template <class T, int N>
 DEVICE void backward_steps(const MingruBackwardParams& p, const UnitIndex& index,
                            MingruGradients<N>& d) {
     MingruBackwardInput<T, N> inputs[STEPS_AHEAD];
-#pragma unroll
     for (int i = 0; i < STEPS_AHEAD; i++)
         load(inputs[i], p, index, max(p.n_steps - 1 - i, 0));
     float start[N];
@@ -158,7 +171,6 @@ DEVICE void backward_steps(const MingruBackwardParams& p, const UnitIndex& index
     if (p.d_last)
         read<float>(d.state, p.d_last, index.unit);
     for (int last = p.n_steps - 1; last >= 0; last -= STEPS_AHEAD) {
-#pragma unroll
         for (int i = 0; i < STEPS_AHEAD; i++) {
             int t = last - i;
             if (t < 0)
@@ -194,7 +206,7 @@ DEVICE void add_lanes(const float (&sums)[N], int width, float* target) {
 template <class T, int N>
 DEVICE void backward(const MingruBackwardParams& p) {
     UnitIndex index;
-    bool exists = find_index<2>(p, index);
+    bool exists = find_index(p, index);
     MingruGradients<N> d;
     clear(d.state);
     clear(d.update_sum);
@@ -212,6 +224,17 @@ DEVICE void backward(const MingruBackwardParams& p) {
 }
 
 template <class T>
+DEVICE void forward(const MingruForwardParams& p) {
+    UnitIndex index;
+    if (!find_index(p, index))
+        return;
+    if (p.n_units == 4)
+        forward<T, 4>(p, index);
+    else
+        forward<T, 1>(p, index);
+}
+
+template <class T>
 DEVICE void backward(const MingruBackwardParams& p) {
     if (p.n_units == 4)
         backward<T, 4>(p);
@@ -219,7 +242,7 @@ DEVICE void backward(const MingruBackwardParams& p) {
         backward<T, 1>(p);
 }
 
-INSTANCE(BOUNDS(64) mingru_forward_float32, MingruForwardParams, run<MingruForward, float>)
-INSTANCE(BOUNDS(64) mingru_forward_bfloat16, MingruForwardParams, run<MingruForward, Bfloat16>)
-INSTANCE(BOUNDS(256) mingru_backward_float32, MingruBackwardParams, backward<float>)
-INSTANCE(BOUNDS(256) mingru_backward_bfloat16, MingruBackwardParams, backward<Bfloat16>)
+INSTANCE(__launch_bounds__(64) mingru_forward_float32, MingruForwardParams, forward<float>)
+INSTANCE(__launch_bounds__(64) mingru_forward_bfloat16, MingruForwardParams, forward<Bfloat16>)
+INSTANCE(__launch_bounds__(256) mingru_backward_float32, MingruBackwardParams, backward<float>)
+INSTANCE(__launch_bounds__(256) mingru_backward_bfloat16, MingruBackwardParams, backward<Bfloat16>)

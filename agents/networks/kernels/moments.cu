@@ -1,9 +1,6 @@
-// Means and variances of observations over lanes, in parts that masked_moments adds up; and adding
-// them to running statistics, one block per leaf.
-#include "block_sum.h"
-#include "constants.h"
-#include "half.h"
-#include "lanes.h"
+// Means and variances, in parts that masked_moments adds up, and adding them to running statistics:
+// of observations over lanes; and of the valid ones of many numbers, such as returns.
+#include "common/sums.h"
 #include "params.h"
 
 DEVICE float number_at(const IntakeLeafParams& leaf, long long at) {
@@ -34,7 +31,6 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
             for (int i = 0; i < leaf.group / 8; i++) {
                 uint4 word = words[i];
                 const unsigned int pairs[4] = {word.x, word.y, word.z, word.w};
-#pragma unroll
                 for (int n = 0; n < 4; n++) {
                     add(sum, half_value(pairs[n] & 0xffff), mean, is_square);
                     add(sum, half_value(pairs[n] >> 16), mean, is_square);
@@ -48,7 +44,7 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
 }
 
 // Blocks along x: parts of the lanes; along y: statistics.
-KERNEL BOUNDS(256) moments(MomentsParams p) {
+KERNEL __launch_bounds__(256) moments(MomentsParams p) {
     wait_for_previous();
     int statistic = blockIdx.y, leaf = 0;
     for (; statistic >= p.leaves[leaf].n_features / p.leaves[leaf].group; leaf++)
@@ -72,7 +68,7 @@ KERNEL BOUNDS(256) moments(MomentsParams p) {
 }
 
 // Changes nothing if no lane was counted, if moments do not count, or if a number is not finite.
-KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
+KERNEL __launch_bounds__(1024) add_moments(AddMomentsParams p) {
     wait_for_previous();
     const RunningNormParams& norm = p.norms[blockIdx.x];
     bool is_counted = !p.is_counted || *p.is_counted;
@@ -100,4 +96,89 @@ KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
     }
     if (!threadIdx.x)
         *norm.count = count;
+}
+
+// ---- The valid ones of many numbers; blocks along y: arrays ----
+
+static_assert(sizeof(MaskedPartsParams::arrays) == MASKED_ARRAYS * sizeof(MaskedArrayParams));
+
+// A block has MASKED_NUMBERS neighbouring numbers of an array per thread.
+KERNEL __launch_bounds__(256) masked_parts(MaskedPartsParams p) {
+    wait_for_previous();
+    const float* values = p.arrays[blockIdx.y].values;
+    int first = blockIdx.x * (MASKED_THREADS * MASKED_NUMBERS) + threadIdx.x;
+    float numbers[MASKED_NUMBERS], count = 0.f, sum = 0.f, squares = 0.f;
+    bool counts[MASKED_NUMBERS];
+    for (int i = 0; i < MASKED_NUMBERS; i++) {
+        int at = first + i * MASKED_THREADS;
+        counts[i] = at < p.n && p.valid[at];
+        numbers[i] = at < p.n ? values[at] : 0.f;
+    }
+    for (int i = 0; i < MASKED_NUMBERS; i++) {
+        count += counts[i] ? 1.f : 0.f;
+        sum += counts[i] ? numbers[i] : 0.f;
+    }
+    count = sum_of_block<MASKED_THREADS>(count);
+    float mean = __fdiv_rn(sum_of_block<MASKED_THREADS>(sum), fmaxf(count, 1.f));
+    for (int i = 0; i < MASKED_NUMBERS; i++) {
+        float away = numbers[i] - mean;
+        squares += counts[i] ? away * away : 0.f;
+    }
+    squares = sum_of_block<MASKED_THREADS>(squares);
+    if (threadIdx.x)
+        return;
+    float* part = p.parts + 3ll * ((long long)blockIdx.y * gridDim.x + blockIdx.x);
+    part[0] = count;
+    part[1] = mean;
+    part[2] = squares;
+}
+
+// A block adds up the parts of an array (Chan et al. 1979).
+KERNEL __launch_bounds__(256) masked_moments(MaskedMomentsParams p) {
+    wait_for_previous();
+    const float* parts = p.parts + 3ll * blockIdx.y * p.n_parts;
+    double count = 0., sum = 0., squares = 0.;
+    for (int i = threadIdx.x; i < p.n_parts; i += MASKED_THREADS) {
+        count += parts[3 * i];
+        sum += (double)parts[3 * i] * parts[3 * i + 1];
+    }
+    count = sum_of_block<MASKED_THREADS>(count);
+    double n = count < 1. ? 1. : count, mean = sum_of_block<MASKED_THREADS>(sum) / n;
+    for (int i = threadIdx.x; i < p.n_parts; i += MASKED_THREADS) {
+        double away = parts[3 * i + 1] - mean;
+        squares += parts[3 * i + 2] + parts[3 * i] * away * away;
+    }
+    squares = sum_of_block<MASKED_THREADS>(squares);
+    if (threadIdx.x)
+        return;
+    p.moments[blockIdx.y] = (float)mean;
+    p.moments[gridDim.y + blockIdx.y] = (float)(squares / n);
+    if (!blockIdx.y)
+        *p.n_valid = (long long)count;
+}
+
+// Changes nothing if no return is valid, if a number is not finite, or if all returns have been 0.
+KERNEL __launch_bounds__(256) add_returns(AddReturnsParams p) {
+    wait_for_previous();
+    float old_mean = *p.mean, old_scale = *p.scale, count = *p.count + 1.f;
+    float rate = fminf(fmaxf(__fdiv_rn(1.f, count), p.min_rate), 1.f);
+    float away = *p.new_mean - old_mean, old_variance = old_scale * old_scale;
+    float variance =
+        old_variance + rate * (*p.new_variance - old_variance) + rate * (1.f - rate) * away * away;
+    float mean = old_mean + rate * away, scale = sqrtf(variance);
+    bool is_nothing = count == 1.f && scale == 0.f && mean == 0.f;
+    float min_scale = fmaxf(p.min_scale, RESOLUTION * fabsf(mean));
+    scale = scale < min_scale ? min_scale : scale;  // NaN stays
+    bool is_counted = !p.is_counted || *p.is_counted;
+    if (!is_counted || is_nothing || *p.n_valid <= 0 || !isfinite(mean + scale))
+        return;
+    for (int i = threadIdx.x; i < p.width; i += MASKED_THREADS)
+        p.weight[i] *= __fdiv_rn(old_scale, scale);
+    __syncthreads();  // all have read the old statistics
+    if (threadIdx.x)
+        return;
+    *p.bias = __fdiv_rn(*p.bias * old_scale + (old_mean - mean), scale);
+    *p.mean = mean;
+    *p.scale = scale;
+    *p.count = count;
 }

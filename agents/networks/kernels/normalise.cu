@@ -1,8 +1,6 @@
 // The intake of observations: normalises all leaves, selects lanes, concatenates, rounds. A thread
 // handles four columns of several rows, so that it reads their statistics once.
-#include "constants.h"
-#include "half.h"
-#include "lanes.h"
+#include "number.h"
 #include "params.h"
 
 static_assert(sizeof(NormaliseParams::leaves) == MAX_LEAVES * sizeof(IntakeLeafParams));
@@ -36,7 +34,6 @@ DEVICE Feature find(const NormaliseParams& p, int number) {
                        p.leaves[0].group,
                        p.leaves[0].is_half,
                        -1};
-#pragma unroll
     for (int i = 0; i < MAX_LEAVES; i++) {
         const IntakeLeafParams& leaf = p.leaves[i];
         if (number >= 0 && number < leaf.n_features)
@@ -69,7 +66,6 @@ template <class Word>
 DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int column,
                            const Feature& feature) {
     float means[4], scales[4];
-#pragma unroll
     for (int n = 0; n < 4; n++) {
         int at = (feature.number + n) / feature.group;
         means[n] = feature.mean[at];
@@ -77,17 +73,13 @@ DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int colum
     }
     Word words[NORMALISED_ROWS];
     const Word* first = (const Word*)feature.values + feature.number / 4;
-#pragma unroll
     for (int i = 0; i < NORMALISED_ROWS; i++)
         words[i] = first[(long long)rows.source[i] * (feature.n_features / 4)];
-#pragma unroll
     for (int n = 0; n < 4; n++)
         scales[n] = __fdiv_rn(1.f, scales[n]);
-#pragma unroll
     for (int i = 0; i < NORMALISED_ROWS; i++) {
         float values[4];
         unpack(values, words[i]);
-#pragma unroll
         for (int n = 0; n < 4; n++)
             values[n] = (values[n] - means[n]) * scales[n];
         write_row(p, rows, i, column, values);
@@ -97,7 +89,6 @@ DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int colum
 // Any four features, one by one.
 DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int column) {
     float values[NORMALISED_ROWS][4];
-#pragma unroll
     for (int n = 0; n < 4; n++) {
         Feature feature = find(p, column + n);
         int number = max(feature.number, 0), at = number / feature.group;
@@ -105,14 +96,12 @@ DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int c
         const unsigned short* halves = (const unsigned short*)feature.values;
         // a float as two halves, so that no load depends on a branch
         unsigned int low[NORMALISED_ROWS], high[NORMALISED_ROWS];
-#pragma unroll
         for (int i = 0; i < NORMALISED_ROWS; i++) {
             long long first = (long long)rows.source[i] * feature.n_features + number;
             first = feature.is_half ? first : 2 * first;
             low[i] = halves[first];
             high[i] = halves[feature.is_half ? first : first + 1];
         }
-#pragma unroll
         for (int i = 0; i < NORMALISED_ROWS; i++) {
             float value =
                 feature.is_half ? half_value(low[i]) : __uint_as_float(high[i] << 16 | low[i]);
@@ -120,13 +109,12 @@ DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int c
             values[i][n] = feature.number < 0 ? 0.f : value;
         }
     }
-#pragma unroll
     for (int i = 0; i < NORMALISED_ROWS; i++)
         write_row(p, rows, i, column, values[i]);
 }
 
 // Blocks along y: steps.
-KERNEL BOUNDS(64) normalise(NormaliseParams p) {
+KERNEL __launch_bounds__(64) normalise(NormaliseParams p) {
     wait_for_previous();
     unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, n_words = p.n_columns / 4;
     unsigned int n_selected = p.n_selected, n_plain = p.n_plain_words;
@@ -142,7 +130,6 @@ KERNEL BOUNDS(64) normalise(NormaliseParams p) {
     if (first >= step)
         return;
     Rows rows;
-#pragma unroll
     for (int i = 0; i < NORMALISED_ROWS; i++) {
         unsigned int m = min(first + i * step, n_selected - 1);
         unsigned int lane = p.lanes ? (unsigned int)p.lanes[m] : m;

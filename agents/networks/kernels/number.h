@@ -1,6 +1,6 @@
-// Reading and writing float32 and bfloat16 numbers, several at once, and the gates' activations.
+// Reading and writing float32 and bfloat16 numbers, several at once.
 #pragma once
-
+#include "common/constants.h"
 #include "common/dependent_launch.h"
 
 // The upper half of a float. Not cuda_bf16.h, so NVRTC needs no include folder.
@@ -82,5 +82,18 @@ DEVICE void write(void* base, long long index, const float (&values)[N]) {
     ((Pack<T, N>*)((T*)base + index))->word = pack.word;
 }
 
-// For large |x| the exponential is 0 or infinite and the quotient 1 or 0. NaN stays NaN.
-DEVICE float sigmoid(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
+// Reads eight neighbours, which take two words.
+DEVICE void read_eight(float (&values)[8], const float* address) {
+    for (int i = 0; i < 8; i += 4) {
+        float four[4];
+        read<float>(four, address, i);
+        for (int n = 0; n < 4; n++)
+            values[i + n] = four[n];
+    }
+}
+
+template <int N>
+DEVICE void clear(float (&values)[N]) {
+    for (int n = 0; n < N; n++)
+        values[n] = 0.f;
+}

@@ -2,8 +2,8 @@
 // handles one word of N columns in several rows. A block handles at most 32 words at once, and a
 // warp as many rows at once as it has threads for.
 #pragma once
-#include "constants.h"
-#include "lanes.h"
+#include "number.h"
+#include "params.h"
 
 constexpr int STRIP_WARPS = STRIP_THREADS / WARP;
 constexpr int AT_ONCE = 4;  // rows of a thread whose loads do not wait for each other

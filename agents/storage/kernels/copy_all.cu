@@ -1,7 +1,6 @@
 // Copies many pieces of memory in one launch. A block copies neighbouring words of one piece.
 #include "common/constants.h"
 #include "common/rows.h"
-#include "constants.h"
 #include "params.h"
 
 constexpr unsigned int BLOCK_BYTES = 16 * BLOCK * COPY_WORDS;
@@ -19,11 +18,9 @@ KERNEL copy_all(CopyAllParams p) {
     unsigned int first = block * (BLOCK * COPY_WORDS) + threadIdx.x;
     const uint4* source = (const uint4*)copy.source;
     uint4 words[COPY_WORDS];
-#pragma unroll
     for (int i = 0; i < COPY_WORDS; i++)
         if (first + i * BLOCK < n_words)
             words[i] = source[first + i * BLOCK];
-#pragma unroll
     for (int i = 0; i < COPY_WORDS; i++)
         if (first + i * BLOCK < n_words)
             ((uint4*)copy.target)[first + i * BLOCK] = words[i];

@@ -1,7 +1,6 @@
 // Reads sequences from the replay buffer, one thread per word. The first block computes the
 // importance weights, the next ones read the flags, then those of each tensor follow.
-#include "common/backend.h"
-#include "constants.h"
+#include "common/sums.h"
 #include "params.h"
 
 static_assert(sizeof(ReadSequencesParams::tensors) == MAX_SELECTED * sizeof(ReadTensorParams));
@@ -51,7 +50,7 @@ DEVICE void read_word(const ReadSequencesParams& p, const ReadTensorParams& tens
             ((unsigned char*)target)[at] = ((const unsigned char*)source)[from];
             break;
         default:
-            ((float*)target)[at] = HALF_VALUE(((const unsigned short*)source)[from]);
+            ((float*)target)[at] = half_value(((const unsigned short*)source)[from]);
     }
 }
 
@@ -70,7 +69,6 @@ DEVICE void read_flags(const ReadSequencesParams& p, unsigned int at) {
 
 // One block
 DEVICE void read_weights(const ReadSequencesParams& p) {
-    __shared__ double of_warps[READ_THREADS / WARP];
     double largest = 0.;
     for (unsigned int i = threadIdx.x; i < p.n_sequences; i += blockDim.x) {
         double ratio = (double)*p.n_available * p.probability[i];
@@ -80,13 +78,7 @@ DEVICE void read_weights(const ReadSequencesParams& p) {
         long long age = *p.n_added - 1 - start_of(p, i).slot, n = p.n_rollouts;
         p.age[i] = (age % n + n) % n;
     }
-    for (int mask = WARP / 2; mask; mask /= 2)
-        largest = fmax(largest, __shfl_xor_sync(FULL_WARP, largest, mask));
-    if (threadIdx.x % WARP == 0)
-        of_warps[threadIdx.x / WARP] = largest;
-    __syncthreads();
-    for (int warp = 0; warp < READ_THREADS / WARP; warp++)
-        largest = fmax(largest, of_warps[warp]);
+    largest = largest_of_block<READ_THREADS>(largest);
     for (unsigned int i = threadIdx.x; i < p.n_sequences; i += blockDim.x)
         p.weight[i] = (float)(p.weights[i] / largest);
 }

@@ -12,9 +12,7 @@ KERNEL sample_tree(SampleTreeParams p) {
     for (int level = p.tree.n_levels - 1; level >= 0; level--) {
         double sum = p.tree.levels[level].sums[index * WARP + lane];
         if (level == p.tree.n_levels - 1) {
-            total = sum;
-            for (int mask = WARP / 2; mask; mask /= 2)
-                total += __shfl_xor_sync(~0u, total, mask);
+            total = sum_of_threads(sum);
             rest = (p.fractions[sample] + sample) / p.n_samples * total;
         }
         int child = find_child(sum, rest);

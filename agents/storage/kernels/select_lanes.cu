@@ -2,7 +2,6 @@
 // thread several of them, whose loads do not wait for each other.
 #include "common/constants.h"
 #include "common/rows.h"
-#include "constants.h"
 #include "params.h"
 
 static_assert(sizeof(SelectLanesParams::tensors) == MAX_SELECTED * sizeof(SelectParams));
@@ -13,7 +12,6 @@ __device__ void copy_words(const SelectLanesParams& p, const SelectParams& tenso
     const Word* source = (const Word*)tensor.source;
     unsigned int n = tensor.n_steps * p.n_selected * tensor.n_words;
     Word words[COPY_WORDS];
-#pragma unroll
     for (int i = 0; i < COPY_WORDS; i++) {
         unsigned int at = first + i * BLOCK;
         if (at >= n)
@@ -22,7 +20,6 @@ __device__ void copy_words(const SelectLanesParams& p, const SelectParams& tenso
         unsigned int t = row / p.n_selected, m = row - t * p.n_selected;
         words[i] = source[((long long)t * p.n_lanes + p.lanes[m]) * tensor.n_words + word];
     }
-#pragma unroll
     for (int i = 0; i < COPY_WORDS; i++)
         if (first + i * BLOCK < n)
             ((Word*)tensor.target)[first + i * BLOCK] = words[i];

@@ -10,7 +10,6 @@ KERNEL set_tree(SetTreeParams p) {
 // `ReplayBuffer.set_priorities`
 KERNEL set_priorities(SetPrioritiesParams p) {
     wait_for_previous();
-    __shared__ double of_warps[SET_THREADS / WARP];
     bool is_ready = *p.n_available > 0 && *p.n_added >= p.first_rollouts;
     double largest = 0.;
     for (int i = threadIdx.x; i < p.n; i += blockDim.x) {
@@ -20,16 +19,8 @@ KERNEL set_priorities(SetPrioritiesParams p) {
         p.values[i] = is_set ? value : old;
         largest = is_set ? fmax(largest, value) : largest;
     }
-    for (int mask = WARP / 2; mask; mask /= 2)
-        largest = fmax(largest, __shfl_xor_sync(~0u, largest, mask));
-    if (threadIdx.x % WARP == 0)
-        of_warps[threadIdx.x / WARP] = largest;
-    __syncthreads();
-    if (!threadIdx.x) {
-        for (int warp = 1; warp < SET_THREADS / WARP; warp++)
-            largest = fmax(largest, of_warps[warp]);
-        if (largest > 0.)
-            *p.new_priority = largest;
-    }
+    largest = largest_of_block<SET_THREADS>(largest);
+    if (!threadIdx.x && largest > 0.)
+        *p.new_priority = largest;
     set_values(p.tree, p.index, p.values, p.n);
 }

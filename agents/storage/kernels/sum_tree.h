@@ -1,8 +1,6 @@
 // The sum tree on a GPU: a block of 32 children is what a warp reads at once.
 #pragma once
-#include "common/constants.h"
-#include "common/dependent_launch.h"
-#include "constants.h"
+#include "common/sums.h"
 #include "params.h"
 
 // The number of the child of a block whose part of the total holds `rest`, from which the children

@@ -1,6 +1,10 @@
 // The parameters of each launch, passed by value; see megastep/kernels/params.h.
 #pragma once
 
+constexpr int GROUP = 8;       // walls that share a bounding box in searches for shortest paths
+constexpr int KEPT = 16;       // links of a corner that need not be searched for twice
+constexpr int MAX_GOALS = 16;  // per home, in one search
+
 // Homes, and the points where shortest paths may bend: D homes, K groups of walls, V corners, G
 // goals per home. See shortest_paths.h.
 struct HomesParams {

@@ -8,7 +8,6 @@
 // Coordinates are relative to the home, so floats are exact to some micrometres.
 #pragma once
 #include "common/math.h"
-#include "constants.h"
 #include "params.h"
 
 constexpr float TANGENT_SLACK = 2e-3f;    // radians: the sides of a polygon count as tangents

@@ -6,7 +6,7 @@ sources, so that structs, constants and operations are declared once:
   ``struct PongParams : StepParams {``
 * constants that are plain numbers, one per line: ``constexpr int MAX_RES = 1024;``
 * operations, each at the start of a line: ``KERNEL render(RenderParams p)``; for a GPU,
-  ``INSTANCE(spawn, SpawnParams, ...)``; in a header, for CPU and GPU, ``EACH(uniform, ...)``
+  ``INSTANCE(physics, PhysicsParams, ...)``; in a header, for both, ``EACH(`` or ``EACH_WARP(spawn,``
 """
 
 import ctypes
@@ -44,7 +44,7 @@ CONSTANT = re.compile(r"^constexpr (int|float) (\w+) = (-?[\d.]+(?:e-?\d+)?)f?;"
 STRUCT = re.compile(r"^struct (\w+Params)(?: : (\w+Params))? \{(.*?)^\};", re.M | re.S)
 FIELD = re.compile(r"(?:const )?([\w ]+?)\s*(\*?)\s*\b(\w+)(?:\[(\d+)\])?")
 OPERATION = re.compile(
-    r"^(?:KERNEL|(INSTANCE|EACH)\()\s*(?:BOUNDS\(\d+\) )?(\w+)(?:, |\((?:const )?)(\w+Params)\b"
+    r"^(?:KERNEL|(INSTANCE|EACH|EACH_WARP)\()\s*(?:\w+\([\w, ]+\) )?(\w+)(?:, |\((?:const )?)(\w+Params)\b"
     r"(?:\s*&?\s*\w+\)\s*\{\s*(wait_for_previous\(\)\s*;)?)?",
     re.M,
 )

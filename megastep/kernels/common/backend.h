@@ -1,6 +1,7 @@
 // Macros that are spelt differently on the CPU and on the GPU:
 //   KERNEL         declares an operation that Python can launch
-//   EACH           defines an operation in a header, for both: a `statement` about parameters p and
+//   HAS_THREADS    defined where KERNEL is a function of one thread
+//   EACH           defines an operation in a header, for both: a statement about parameters p and
 //                  each i below `count`; `threads` of the CPU may depend on n, the count
 //   HD             declares a function for both
 //   RARE           as HD, but calls of it are not inlined on a GPU and in WebAssembly
@@ -22,4 +23,21 @@
 #include "common/backend_cuda.h"
 #else
 #include "common/backend_cpu.h"
+#endif
+
+#ifdef HAS_THREADS
+#define EACH(operation, Params, count, threads, ...)              \
+    KERNEL operation(Params p) {                                  \
+        wait_for_previous();                                      \
+        int n = count, i = blockIdx.x * blockDim.x + threadIdx.x; \
+        if (i < n)                                                \
+            __VA_ARGS__;                                          \
+    }
+#else
+#define EACH(operation, Params, count, threads, ...)                                               \
+    KERNEL operation(const Params& p) {                                                            \
+        int n = count, n_threads = threads;                                                        \
+        _Pragma("omp parallel for schedule(static) num_threads(n_threads)") for (int i = 0; i < n; \
+                                                                                 i++) __VA_ARGS__; \
+    }
 #endif

@@ -8,12 +8,6 @@
 #define RARE static inline
 #endif
 #define KERNEL extern "C" void
-#define EACH(operation, Params, count, threads, statement)                                         \
-    KERNEL operation(const Params& p) {                                                            \
-        int n = count, n_threads = threads;                                                        \
-        _Pragma("omp parallel for schedule(static) num_threads(n_threads)") for (int i = 0; i < n; \
-                                                                                 i++) statement;   \
-    }
 // A tensor may start anywhere in the CPU's memory, so 16-byte records are not aligned.
 #define ALIGNED
 #define SQRT(x) __builtin_sqrtf(x)

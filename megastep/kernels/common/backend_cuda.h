@@ -3,15 +3,9 @@
 #include "common/constants.h"
 #include "common/dependent_launch.h"
 
+#define HAS_THREADS
 #define HD static __device__ __forceinline__
 #define RARE static __device__ __noinline__
-#define EACH(operation, Params, count, threads, statement)        \
-    KERNEL operation(Params p) {                                  \
-        wait_for_previous();                                      \
-        int n = count, i = blockIdx.x * blockDim.x + threadIdx.x; \
-        if (i < n)                                                \
-            statement;                                            \
-    }
 // Blocks that a multiprocessor should hold at once, or as many as it can. With 64 threads each, 24
 // blocks leave a thread 40 of its 65,536 registers, 20 leave it 48, and 18 leave it 56.
 #if __CUDA_ARCH__ == 750 || __CUDA_ARCH__ == 860 || __CUDA_ARCH__ == 870
@@ -59,15 +53,8 @@ DEVICE T load(const T* address) {
     return *(T*)&bits;
 }
 
-// fp16 without cuda_fp16.h: NVRTC then needs no include folder.
 DEVICE unsigned short half_bits(float x) {
     unsigned short bits;
     asm("cvt.rn.f16.f32 %0, %1;" : "=h"(bits) : "f"(x));
     return bits;
-}
-
-DEVICE float half_value(unsigned short bits) {
-    float x;
-    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(bits));
-    return x;
 }

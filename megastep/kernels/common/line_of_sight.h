@@ -2,9 +2,8 @@
 // sides of its disc. The other is hidden if walls cut all three. A gap between walls narrower than
 // an agent's radius, which falls between two lines, may be missed.
 #pragma once
-#include "common/math.h"
+#include "common/group.h"
 #include "common/objects.h"
-#include "common/scenery.h"
 
 // Returns 1 if the wall ab cuts the line from (x, y) to (x + dx, y + dy). A wall's ends count, so
 // that no line passes between two walls that share a corner. Needs no division.
@@ -16,17 +15,6 @@ HD int cuts(float ax, float ay, float bx, float by, float x, float y, float dx, 
            (minf(near_side, far_side) <= 0.f) & (maxf(near_side, far_side) >= 0.f) &
            (cross(dx, dy, vx, vy) != 0.f);
 }
-
-// The threads that work on one environment together. This group is a single thread: always on the
-// CPU, and on the GPU where each environment has one thread. Thread `rank` is one of SIZE.
-struct SingleThread {
-    static constexpr int SIZE = 1;
-    int rank;
-};
-
-HD void sync(const SingleThread&) {}
-
-HD unsigned int reduce_or(const SingleThread&, unsigned int bits) { return bits; }
 
 // The lines of sight, of three, that environment `env`'s obstacles cut: a bit for each. The lines
 // run from (x, y) to (x + dx, y + dy) and to both sides of it.

@@ -49,6 +49,10 @@ HD int layout_of(const SceneryParams& s, int env, int* error_flag) {
 // 50 us.
 HD int threads_for(const SceneryParams& s, int n, int min) { return n < min ? 1 : s.n_threads; }
 
+HD int threads_for_agents(const SceneryParams& s, int min) {
+    return threads_for(s, s.n_envs * s.n_agents, min);
+}
+
 // A layout's walls [first_wall, end_wall) and bounding boxes [first_box, end_box).
 struct Walls {
     int first_wall, end_wall, first_box, end_box;

@@ -4,6 +4,8 @@
 
 // ---- Numbers ----
 
+typedef unsigned short Bits;  // of a bfloat16
+
 DEVICE float low_half(unsigned int pair) { return __uint_as_float(pair << 16); }
 
 DEVICE float high_half(unsigned int pair) { return __uint_as_float(pair & 0xffff0000u); }

@@ -12,13 +12,8 @@
 //
 // In shared memory, a row of a part, of a lane or of a weight, has eight words of 16 bytes. Word i
 // of row r is at i ^ r % 8, so that words i of eight rows are in different banks.
-#include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
-#include "constants.h"
 #include "params.h"
-
-// Two blocks of a multiprocessor, which leave a thread 128 registers.
-#define BOUNDS(n_threads) __launch_bounds__(n_threads, 2)
 
 constexpr int LANES = STEP_LANES, ROWS = STEP_ROWS, INNER = STEP_INNER, STAGES = STEP_STAGES;
 constexpr int THREADS = STEP_THREADS;
@@ -30,15 +25,13 @@ constexpr int ROW_BYTES = 2 * INNER;         // of a part
 constexpr int ROW_WORDS = ROW_BYTES / WORD;  // of a part
 constexpr int STAGE_BYTES = (LANES + ROWS) * ROW_BYTES;
 
-typedef unsigned short Bits;  // of a bfloat16
-
 static_assert(THREADS == 32 * (LANES / WARP_LANES) * 2,
               "two warps have the rows of a warp's lanes");
 
 extern __shared__ __align__(128) unsigned char shared_memory[];
 
 // The minGRU's update gate after activation, with the same bits as in the kernel that learns; see
-// number.h.
+// mingru.cu.
 DEVICE float activate(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
 
 // Where a word of a part's row is, in bytes. Eight rows on, words have the same order. Word w ^ i
@@ -95,7 +88,6 @@ DEVICE void begin_part(int part, const B& block, unsigned int resets, const Step
     first += word * WORD_NUMBERS;
     const Bits* lanes = (const Bits*)(is_output ? p.last_output : p.x) + first;
     unsigned char* target = shared_memory + part % STAGES * STAGE_BYTES + word_at(row, word);
-#pragma unroll
     for (int i = 0; i < LANES / STEP; i++) {
         const Bits* source = lanes + (long long)lane_of(block, row + i * STEP, p) * p.width;
         unsigned char* to = target + i * STEP * ROW_BYTES;
@@ -106,7 +98,6 @@ DEVICE void begin_part(int part, const B& block, unsigned int resets, const Step
     }
     int inner = (B::HAS_OUTPUT ? 2 : 1) * p.width;
     const Bits* weight = (const Bits*)p.weight + (is_output ? p.width : 0) + first;
-#pragma unroll
     for (int i = 0; i < ROWS; i += STEP) {
         int gate = (row + i) / B::UNITS, unit = block.first_unit + (row + i) % B::UNITS;
         begin_copy(target + (LANES + i) * ROW_BYTES,
@@ -127,7 +118,6 @@ DEVICE void begin_states(unsigned char* states, const B& block, const StepParams
     static_assert(LANES * B::STATE_WORDS * WORD <= STAGE_BYTES && STEP % 8 == 0, "they fit");
     int lane = threadIdx.x / B::STATE_WORDS, word = threadIdx.x % B::STATE_WORDS;
     const float* source = p.last_state + block.first_unit + word * (WORD / 4);
-#pragma unroll
     for (int i = 0; i < LANES; i += STEP)
         begin_copy(states + state_at<B>(lane + i, word),
                    source + (long long)lane_of(block, lane + i, p) * p.width);
@@ -137,12 +127,9 @@ DEVICE void begin_states(unsigned char* states, const B& block, const StepParams
 template <class B>
 DEVICE void begin_sums(Sums<B>& sums, const B& block, const StepParams& p) {
     const Bits* bias = (const Bits*)p.bias + block.first_unit + block.units + threadIdx.x % 4 * 2;
-#pragma unroll
     for (int gate = 0; gate < B::GATES; gate++)
-#pragma unroll
         for (int j = 0; j < B::UNIT_TILES; j++) {
             unsigned int pair = *(const unsigned int*)(bias + gate * p.width + 8 * j);
-#pragma unroll
             for (int m = 0; m < LANE_TILES; m++) {
                 sums.of[m][gate][j][0] = sums.of[m][gate][j][2] = low_half(pair);
                 sums.of[m][gate][j][1] = sums.of[m][gate][j][3] = high_half(pair);
@@ -158,10 +145,8 @@ DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& blo
     // weights the other way round.
     int left_at = word_at(block.lanes + thread % 16, thread / 16);
     int right_at = word_at(LANES + block.units + thread / 16 * 8 + thread % 8, thread / 8 % 2);
-#pragma unroll
     for (int k = 0; k < ROW_WORDS; k += 2) {
         unsigned int left[LANE_TILES][4], right[B::GATES][B::UNIT_TILES][2];
-#pragma unroll
         for (int m = 0; m < LANE_TILES; m++) {
             unsigned int near[2], far[2];
             load_matrices(near, far, part + (left_at ^ k * WORD) + 16 * m * ROW_BYTES);
@@ -170,17 +155,12 @@ DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& blo
             left[m][2] = far[0];
             left[m][3] = far[1];
         }
-#pragma unroll
         for (int gate = 0; gate < B::GATES; gate++)
-#pragma unroll
             for (int j = 0; j < B::UNIT_TILES; j += 2)
                 load_matrices(right[gate][j], right[gate][j + 1],
                               part + (right_at ^ k * WORD) + (gate * B::UNITS + 8 * j) * ROW_BYTES);
-#pragma unroll
         for (int m = 0; m < LANE_TILES; m++)
-#pragma unroll
             for (int gate = 0; gate < B::GATES; gate++)
-#pragma unroll
                 for (int j = 0; j < B::UNIT_TILES; j++)
                     multiply_add(sums.of[m][gate][j], left[m], right[gate][j][0],
                                  right[gate][j][1]);
@@ -218,11 +198,9 @@ DEVICE void update(const Sums<B>& sums, unsigned char* part, unsigned char* stat
     int first_state = state_at<B>(block.lanes + g, block.units / 4 + q / 2) + q % 2 * 8;
 #pragma unroll
     for (int m = 0; m < LANE_TILES; m++)
-#pragma unroll
         for (int half = 0; half < 2; half++) {
             int row = 16 * m + 8 * half;  // and g
             bool is_reset = resets >> (row + g) & 1;
-#pragma unroll
             for (int j = 0; j < B::UNIT_TILES; j++) {
                 auto& state =
                     *(float2*)(states + (first_state ^ 2 * j * WORD) + row * B::STATE_WORDS * WORD);
@@ -247,7 +225,6 @@ DEVICE void write_words(void* target, long long stride, const unsigned char* fro
                         At at) {
     constexpr int STEP = 32 / WORDS;
     int lane = threadIdx.x % 32 / WORDS, word = threadIdx.x % WORDS;
-#pragma unroll
     for (int i = lane; i < lane + WARP_LANES; i += STEP)
         if (i < n_lanes)
             *(uint4*)((char*)target + i * stride + word * WORD) =
@@ -282,7 +259,6 @@ DEVICE void step(const StepParams& p) {
     int n_parts = (B::HAS_OUTPUT ? 2 : 1) * p.width / INNER;
     unsigned int resets = 0;
     if (B::HAS_OUTPUT)
-#pragma unroll
         for (int i = 0; i < LANES * ROW_WORDS / THREADS; i++) {
             int lane = threadIdx.x / ROW_WORDS + i * (THREADS / ROW_WORDS);
             resets |= (p.reset[lane_of(block, lane, p)] ? 1u : 0u) << i;
@@ -320,5 +296,6 @@ DEVICE void step(const StepParams& p) {
         write_outputs(p.next_output, plain, block, first, p);
 }
 
-INSTANCE(BOUNDS(256) mingru_step, StepParams, step<2>)
-INSTANCE(BOUNDS(256) lstm_step, StepParams, step<4>)
+// Two blocks of a multiprocessor leave a thread 128 registers.
+INSTANCE(__launch_bounds__(256, 2) mingru_step, StepParams, step<2>)
+INSTANCE(__launch_bounds__(256, 2) lstm_step, StepParams, step<4>)

@@ -12,10 +12,8 @@
 // with g = lane / 4 and q = lane % 4 of the warp. Rows are laid out so that these are the four
 // gates of one unit. So gates and cells never leave their thread, and what the backward pass needs
 // is saved in the order of the threads.
-#include "constants.h"
-#include "params.h"
-#include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
+#include "params.h"
 
 // Blocks of a cluster. One block per multiprocessor, which leaves a thread 255 registers.
 #define BOUNDS(n_blocks) __cluster_dims__(n_blocks, 1, 1) __launch_bounds__(THREADS, 1)
@@ -34,8 +32,6 @@ struct Group {
 };
 static_assert(Group<0>::COLUMNS + Group<1>::COLUMNS == COLUMNS);
 
-typedef unsigned short Bits;  // of a bfloat16
-
 extern __shared__ __align__(16) unsigned char shared_memory[];
 
 // A thread's place: its unit in the block, and its lanes 8 j + 2 q + {0, 1} of column j.
@@ -52,7 +48,6 @@ DEVICE Thread this_thread() {
 // lanes two parts. `row` is this thread's row of the first two columns.
 template <int C>
 DEVICE void load_columns(unsigned int (&parts)[C][2], const Bits* row, int lanes_apart) {
-#pragma unroll
     for (int j = 0; j + 1 < C; j += 2)
         load_matrices(parts[j], parts[j + 1], row + j * lanes_apart);
     if (C % 2)
@@ -68,14 +63,11 @@ DEVICE void multiply(float (&sums)[TILES][C][4], const unsigned int (&left)[TILE
                       8 * (me.warp_lane >> 3 & 1);
     unsigned int parts[2][C][2];  // of this step of the product and of the next
     load_columns(parts[0], row, 8 * (N + PAD));
-#pragma unroll
     for (int k = 0; k < K / 16; k++) {
         int next = 16 * (k + 1);
         if (next < K)
             load_columns(parts[(k + 1) & 1], row + next / N * piece + next % N, 8 * (N + PAD));
-#pragma unroll
         for (int tile = 0; tile < TILES; tile++)
-#pragma unroll
             for (int j = 0; j < C; j++)
                 multiply_add(sums[tile][j], left[tile][k], parts[k & 1][j][0], parts[k & 1][j][1]);
     }
@@ -93,7 +85,6 @@ DEVICE void read_resets(Resets* words, const unsigned char* reset, int n_steps, 
                         int first_lane, const Thread& me) {
     for (int t = me.warp; t < n_steps; t += THREADS / 32) {
         Resets word = 0;
-#pragma unroll
         for (int first = 0; first < LANES; first += 32) {
             int lane = min(first_lane + first + me.warp_lane, n_lanes - 1);
             word |= (Resets)__ballot_sync(~0u, reset[(long long)t * n_lanes + lane]) << first;
@@ -155,7 +146,6 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
 
     auto begin_gates = [&](int t) {
         if (t < n_steps) {
-#pragma unroll
             for (int n = 0; n < LANES * GATES / 8 / THREADS; n++) {
                 int i = me.index + n * THREADS, lane = i >> 5, gate = i >> 3 & 3;
                 int part = 8 * (i & 7);
@@ -181,9 +171,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     const Bits* weight = (const Bits*)p.weight;
 #pragma unroll
     for (int tile = 0; tile < 2; tile++)
-#pragma unroll
         for (int k = 0; k < W / 16; k++)
-#pragma unroll
             for (int part = 0; part < 4; part++) {
                 int gate = 2 * tile + (part & 1), column = 16 * k + 2 * me.q + 8 * (part >> 1);
                 weights[tile][k][part] =
@@ -201,9 +189,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
             *(unsigned int*)(hiddens + (long long)from * W + column) = bits;
     }
     float cells[COLUMNS][2];
-#pragma unroll
     for (int j = 0; j < COLUMNS; j++)
-#pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = min(first_lane + 8 * j + 2 * me.q + e, last_lane);
             cells[j][e] = reset[lane] ? 0.f : p.last_cell[(long long)lane * W + unit];
@@ -226,11 +212,8 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         bool is_last = t + 1 == n_steps;
         Resets resets = is_last ? 0 : memory.resets[t + 1] >> (2 * me.q);
         float sums[2][C][4];
-#pragma unroll
         for (int tile = 0; tile < 2; tile++)
-#pragma unroll
             for (int j = 0; j < C; j++)
-#pragma unroll
                 for (int part = 0; part < 4; part++) {
                     int gate = 2 * tile + (part >> 1);
                     int lane = G::FIRST_LANE + 8 * j + 2 * me.q + (part & 1);
@@ -247,9 +230,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                            LANES * (UNITS + PAD), me);
 
         unsigned int rounded[2][C][2];  // input | forget, candidate | output
-#pragma unroll
         for (int j = 0; j < C; j++)
-#pragma unroll
             for (int e = 0; e < 2; e++) {
                 rounded[0][j][e] = pack_bfloat16(sums[0][j][e], sums[0][j][2 + e]);
                 rounded[1][j][e] = pack_bfloat16(sums[1][j][e], sums[1][j][2 + e]);
@@ -257,7 +238,6 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         if (p.saved_gates) {
             long long first =
                 COLUMNS * saved_block(t, cluster, p.n_clusters, RANKS, rank) + G::FIRST_COLUMN;
-#pragma unroll
             for (int j = 0; j < C; j++) {
                 long long at = (first + j) * THREADS + me.index;
                 const float (&cell)[2] = cells[G::FIRST_COLUMN + j];
@@ -266,9 +246,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                 __stcs((float2*)p.saved_cells + at, float2{cell[0], cell[1]});
             }
         }
-#pragma unroll
         for (int j = 0; j < C; j++)
-#pragma unroll
             for (int e = 0; e < 2; e++) {
                 float& cell = cells[G::FIRST_COLUMN + j][e];
                 float input = sigmoid(low_half(rounded[0][j][e]));
@@ -298,7 +276,6 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                 uint4 value = *(const uint4*)&memory.next_hidden[t & 1][lane][part];
                 const Bits* target = &memory.hidden[(t + 1) & 1][rank][lane][part];
                 Arrivals* arrivals = &memory.arrivals[(t + 1) & 1][G::NUMBER];
-#pragma unroll
                 for (int other = 0; other < RANKS; other++)
                     send(address_in(target, other), value, address_in(arrivals, other));
                 if (exists)
@@ -320,9 +297,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         run(t, Group<0>());
         run(t, Group<1>());
     }
-#pragma unroll
     for (int j = 0; j < COLUMNS; j++)
-#pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
             if (lane < n_lanes)
@@ -380,9 +355,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     const Bits* weight = (const Bits*)p.weight;
 #pragma unroll
     for (int tile = 0; tile < TILES; tile++)
-#pragma unroll
         for (int k = 0; k < GATES / 16; k++)
-#pragma unroll
             for (int part = 0; part < 4; part++) {
                 int row = ROWS * me.warp + 16 * tile + me.g + 8 * (part & 1);
                 int i = 16 * k + 2 * me.q + 8 * (part >> 1), gate = i / UNITS;
@@ -391,9 +364,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
             }
 
     float d_cells[COLUMNS][2], d_bias[4] = {0.f, 0.f, 0.f, 0.f};
-#pragma unroll
     for (int j = 0; j < COLUMNS; j++)
-#pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
             bool exists = p.d_cell && lane < n_lanes;
@@ -407,7 +378,6 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         if (t < 0)
             return;
         long long first = COLUMNS * saved_block(t, cluster, p.n_clusters, RANKS, rank);
-#pragma unroll
         for (int j = G::FIRST_COLUMN; j < G::FIRST_COLUMN + G::COLUMNS; j++) {
             long long at = (first + j) * THREADS + me.index;
             gates[j] = __ldcs((const uint4*)p.saved_gates + at);
@@ -435,10 +405,8 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         wait_for(arrivals, (n_steps - 1 - t) >> 1);
         if (!me.index)
             expect(arrivals, RANKS * SENT * G::LANES);
-#pragma unroll
         for (int j = 0; j < G::COLUMNS; j++) {
             float2 sum = {0.f, 0.f};
-#pragma unroll
             for (int other = 0; other < RANKS; other++) {
                 const Parts& parts = memory.parts[t & 1][G::NUMBER][other];
                 float2 pair = *(const float2*)&parts[me.unit][8 * j + 2 * me.q];
@@ -458,9 +426,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         float d_hiddens[COLUMNS][2];
         if (has_next)
             receive(d_hiddens, t + 1, group);
-#pragma unroll
         for (int j = 0; j < C; j++)
-#pragma unroll
             for (int e = 0; e < 2; e++) {
                 constexpr int FIRST = G::FIRST_COLUMN;
                 int lane = G::FIRST_LANE + 8 * j + 2 * me.q + e;
@@ -502,20 +468,16 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         __syncthreads();
         float sums[TILES][C][4] = {};
         multiply<GATES, GATES>(sums, weights, &memory.d_gates[G::FIRST_LANE][0], 0, me);
-#pragma unroll
         for (int tile = 0; tile < TILES; tile++)
-#pragma unroll
             for (int upper = 0; upper < 2; upper++) {
                 int row = ROWS * me.warp + 16 * tile + me.g + 8 * upper;
                 const float* target = &memory.parts[t & 1][G::NUMBER][rank][row % UNITS][2 * me.q];
                 unsigned int there = address_in(target, row / UNITS);
                 unsigned int arrivals = address_in(&memory.arrivals[t & 1][G::NUMBER], row / UNITS);
-#pragma unroll
                 for (int j = 0; j < C; j++)
                     send(there + 8 * j * (int)sizeof(float), sums[tile][j][2 * upper],
                          sums[tile][j][2 * upper + 1], arrivals);
             }
-#pragma unroll
         for (int n = 0; n < G::LANES * GATES / 8 / THREADS; n++) {
             int i = me.index + n * THREADS, lane = G::FIRST_LANE + (i >> 5), gate = i >> 3 & 3;
             int part = 8 * (i & 7);
@@ -534,9 +496,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         typedef decltype(group) G;
         float d_hiddens[COLUMNS][2];
         receive(d_hiddens, 0, group);
-#pragma unroll
         for (int j = 0; j < G::COLUMNS; j++)
-#pragma unroll
             for (int e = 0; e < 2; e++) {
                 int lane = G::FIRST_LANE + 8 * j + 2 * me.q + e;
                 if (first_lane + lane < n_lanes) {
@@ -549,7 +509,6 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     };
     end(Group<0>());
     end(Group<1>());
-#pragma unroll
     for (int gate = 0; gate < 4; gate++) {
         float sum = d_bias[gate];
         sum += __shfl_xor_sync(~0u, sum, 1);

@@ -62,16 +62,11 @@ struct Sums {
 template <int R, typename F>
 DEVICE void for_each(Sums<R>& sums, F f) {
     int n = 0;
-#pragma unroll
     for (int e = 0; e < 4; e++) {
-#pragma unroll
         for (int t = 0; t < TAPS; t++)
-#pragma unroll
             for (int j = 0; j < TILES; j++)
                 f(sums.second[t][j][e], n++);
-#pragma unroll
         for (int side = 0; side < 2; side++)
-#pragma unroll
             for (int i = 0; i < R; i++)
                 f(sums.first[side][i][e], n++);
         f(sums.first_bias[e], n++);
@@ -95,10 +90,8 @@ DEVICE void load(BackwardWeights<R>& weights, const ConvBackwardParams& p, const
     const Bits* first = (const Bits*)p.first_weight;
     const Bits* second = (const Bits*)p.second_weight;
     const Bits* first_bias = (const Bits*)p.first_bias;
-#pragma unroll
     for (int part = 0; part < 4; part++) {
         int hidden = 16 * me.half + me.g + 8 * (part & 1);
-#pragma unroll
         for (int i = 0; i < R; i++) {
             int word = 2 * i + (part >> 1), number = WORD * (word % R) + 2 * me.q;
             int channel = number >> 2, tap = 4 * (word / R) + (number & 3);
@@ -107,7 +100,6 @@ DEVICE void load(BackwardWeights<R>& weights, const ConvBackwardParams& p, const
                 weights.first[i][part] =
                     *(const unsigned int*)(first + (hidden * p.n_channels + channel) * 8 + tap);
         }
-#pragma unroll
         for (int i = 0; i < PARTS; i++) {
             int feature = 16 * i + 8 * (part >> 1) + 2 * me.q;
             const Bits* at = second + (feature * CONV_CHANNELS + hidden) * TAPS;
@@ -118,7 +110,6 @@ DEVICE void load(BackwardWeights<R>& weights, const ConvBackwardParams& p, const
             weights.second[3][i][part] = __byte_perm(taps.y, next.y, 0x7632);
         }
     }
-#pragma unroll
     for (int e = 0; e < 2; e++)
         weights.first_bias[e] = low_half(first_bias[16 * me.half + me.g + 8 * e]);
 }
@@ -186,7 +177,6 @@ DEVICE void begin_tile(const Tile& tile, Bits* images, int first_row, int n_feat
             for (int i = me.lane; i < p.n_columns / 4; i += 32) {
                 const Bits* source = rows + channel * p.n_columns + 4 * i;
                 Bits* target = images + image_at<R>(i + 1, channel);
-#pragma unroll
                 for (int n = 0; n < ROWS / WARPS; n++) {
                     begin_copy_or_clear<8>(target, source, me.warp + WARPS * n < n_rows);
                     source += WARPS * p.row_stride;
@@ -203,7 +193,6 @@ DEVICE void transpose(const Tile& tile, int n_features, const ConvBackwardParams
     int row = 2 * me.g;
     for (int i = 4 * me.warp + me.q; i < n_features / WORD; i += 4 * WARPS) {
         unsigned int pairs[2][4];
-#pragma unroll
         for (int e = 0; e < 2; e++) {
             int at = (row + e) * p.staged_size + WORD * i;
             uint4 d = *(const uint4*)(tile.d_features + at);
@@ -215,7 +204,6 @@ DEVICE void transpose(const Tile& tile, int n_features, const ConvBackwardParams
         }
         uint4 places = *(const uint4*)(tile.places + WORD * i);
         unsigned int of_pairs[4] = {places.x, places.y, places.z, places.w};
-#pragma unroll
         for (int n = 0; n < WORD; n++) {
             bool odd = n & 1;
             unsigned int at = odd ? of_pairs[n >> 1] >> 16 : of_pairs[n >> 1] & 0xffff;
@@ -234,7 +222,6 @@ struct Column {
 DEVICE void load_column(Column& column, const Bits* gradients, int i, const Thread& me) {
     const Bits* of_rows = gradients + column_at(i, me.gradients_of_rows);
     const Bits* of_features = gradients + column_at(i, me.gradients_of_features);
-#pragma unroll
     for (int n = 0; n < PARTS; n++) {
         load_matrices(column.of_rows[2 * n], column.of_rows[2 * n + 1], of_rows + 16 * ROWS * n);
         load_transposed(column.of_features[n][0], column.of_features[n][1],
@@ -252,11 +239,9 @@ struct Block {
 template <int R>
 DEVICE void load_block(Block<R>& block, const Bits* images, int i, const Thread& me) {
     images += image_at<R>(i, 0);
-#pragma unroll
     for (int n = 0; n + 1 < R; n += 2) {
         unsigned int first[2], second[2];  // of eight rows each
         load_matrices(first, second, images + me.image_numbers + WORD * n);
-#pragma unroll
         for (int e = 0; e < 2; e++) {
             block.of_numbers[0][n + e] = first[e];
             block.of_numbers[1][n + e] = second[e];
@@ -281,9 +266,7 @@ template <int R, int parity, bool is_last>
 DEVICE void add_hidden(Sums<R>& sums, const BackwardWeights<R>& weights, const Column& column,
                        const Column& next_column, const Block<R>& left, const Block<R>& right) {
     float d_sums[2][4] = {};  // by half of the rows
-#pragma unroll
     for (int part = 0; part < PARTS; part++)
-#pragma unroll
         for (int half = 0; half < 2; half++) {
             const unsigned int (&now)[2] = column.of_features[part][half];
             const unsigned int (&next)[2] = next_column.of_features[part][half];
@@ -293,15 +276,11 @@ DEVICE void add_hidden(Sums<R>& sums, const BackwardWeights<R>& weights, const C
         }
 
     float hidden_sums[2][4];
-#pragma unroll
     for (int half = 0; half < 2; half++) {
-#pragma unroll
         for (int e = 0; e < 4; e++)
             hidden_sums[half][e] = weights.first_bias[e >> 1];
-#pragma unroll
         for (int i = 0; i < R; i++) {
             unsigned int words[2];
-#pragma unroll
             for (int e = 0; e < 2; e++) {
                 int word = 2 * i + e;
                 words[e] =
@@ -312,14 +291,12 @@ DEVICE void add_hidden(Sums<R>& sums, const BackwardWeights<R>& weights, const C
     }
 
     unsigned int hidden[4], d_hidden[4];
-#pragma unroll
     for (int part = 0; part < 4; part++) {
         int half = part >> 1, e = 2 * (part & 1);
         hidden[part] = pack_relu(hidden_sums[half][e], hidden_sums[half][e + 1]);
         d_hidden[part] =
             where_active(hidden[part], pack_bfloat16(d_sums[half][e], d_sums[half][e + 1]));
     }
-#pragma unroll
     for (int j = 0; j < TILES; j++) {
         multiply_add(sums.second[parity + 2][j], hidden, column.of_rows[j][0],
                      column.of_rows[j][1]);
@@ -327,7 +304,6 @@ DEVICE void add_hidden(Sums<R>& sums, const BackwardWeights<R>& weights, const C
             multiply_add(sums.second[parity][j], hidden, next_column.of_rows[j][0],
                          next_column.of_rows[j][1]);
     }
-#pragma unroll
     for (int i = 0; i < R; i++) {
         multiply_add(sums.first[0][i], d_hidden, left.of_rows[i][0], left.of_rows[i][1]);
         multiply_add(sums.first[1][i], d_hidden, right.of_rows[i][0], right.of_rows[i][1]);
@@ -339,7 +315,6 @@ DEVICE void add_hidden(Sums<R>& sums, const BackwardWeights<R>& weights, const C
 template <int R>
 DEVICE void add_bias(Sums<R>& sums, const Column& column, const Thread& me) {
     const unsigned int ones[4] = {ONES, ONES, ONES, ONES};
-#pragma unroll
     for (int j = 0; j < TILES / HALVES; j++) {
         unsigned int first = me.half ? column.of_rows[TILES / 2 + j][0] : column.of_rows[j][0];
         unsigned int second = me.half ? column.of_rows[TILES / 2 + j][1] : column.of_rows[j][1];
@@ -353,18 +328,14 @@ DEVICE void write(const Sums<R>& sums, float* target, int n_channels, const Thre
     float* first_bias = target + CONV_CHANNELS * n_channels * 8;
     float* second = first_bias + CONV_CHANNELS;
     float* second_bias = second + CONV_CHANNELS * CONV_CHANNELS * TAPS;
-#pragma unroll
     for (int e = 0; e < 4; e++) {
         int hidden = 16 * me.half + me.g + 8 * (e >> 1), column = 2 * me.q + (e & 1);
-#pragma unroll
         for (int side = 0; side < 2; side++)
-#pragma unroll
             for (int i = 0; i < R; i++) {
                 int channel = 2 * i + column / 4, tap = 4 * side + column % 4;
                 if (channel < n_channels)
                     target[(hidden * n_channels + channel) * 8 + tap] = sums.first[side][i][e];
             }
-#pragma unroll
         for (int j = 0; j < TILES; j++)
             *(float4*)(second + ((8 * j + column) * CONV_CHANNELS + hidden) * TAPS) = {
                 sums.second[0][j][e], sums.second[1][j][e], sums.second[2][j][e],
@@ -372,7 +343,6 @@ DEVICE void write(const Sums<R>& sums, float* target, int n_channels, const Thre
         if (!me.q && !(e & 1))
             first_bias[hidden] = sums.first_bias[e];
         if (!me.g && e < 2)
-#pragma unroll
             for (int j = 0; j < TILES / HALVES; j++)
                 second_bias[16 * me.half + 8 * j + column] = sums.second_bias[j][e];
     }
@@ -465,7 +435,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
     write(sums, p.sums + block * n_sums, p.n_channels, me);
 }
 
-INSTANCE(BOUNDS(2) conv_backward_2, ConvBackwardParams, conv_backward<1>)
-INSTANCE(BOUNDS(2) conv_backward_4, ConvBackwardParams, conv_backward<2>)
-INSTANCE(BOUNDS(2) conv_backward_6, ConvBackwardParams, conv_backward<3>)
-INSTANCE(BOUNDS(2) conv_backward_8, ConvBackwardParams, conv_backward<4>)
+INSTANCE(__launch_bounds__(THREADS, 2) conv_backward_2, ConvBackwardParams, conv_backward<1>)
+INSTANCE(__launch_bounds__(THREADS, 2) conv_backward_4, ConvBackwardParams, conv_backward<2>)
+INSTANCE(__launch_bounds__(THREADS, 2) conv_backward_6, ConvBackwardParams, conv_backward<3>)
+INSTANCE(__launch_bounds__(THREADS, 2) conv_backward_8, ConvBackwardParams, conv_backward<4>)

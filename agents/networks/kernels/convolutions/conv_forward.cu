@@ -50,7 +50,6 @@ DEVICE void write_features(Bits* features, const Bits* source, int first_row, in
 
 // Sets the sums of two rows to the bias, two numbers per tile.
 DEVICE void begin_sums(float (&sums)[TILES][4], const unsigned int (&bias)[TILES]) {
-#pragma unroll
     for (int j = 0; j < TILES; j++) {
         sums[j][0] = sums[j][2] = low_half(bias[j]);
         sums[j][1] = sums[j][3] = high_half(bias[j]);
@@ -71,10 +70,8 @@ DEVICE void load(ForwardWeights<N>& weights, const ConvForwardParams& p, int g, 
     const Bits* second = (const Bits*)p.second_weight;
     const Bits* first_bias = (const Bits*)p.first_bias;
     const Bits* second_bias = (const Bits*)p.second_bias;
-#pragma unroll
     for (int j = 0; j < TILES; j++) {
         int feature = 8 * j + g;
-#pragma unroll
         for (int n = 0; n < N / 4; n++) {
             int channel = 4 * n + q;
             uint4 taps = {0u, 0u, 0u, 0u};
@@ -85,9 +82,7 @@ DEVICE void load(ForwardWeights<N>& weights, const ConvForwardParams& p, int g, 
             weights.first[n][1][j][0] = taps.z;
             weights.first[n][1][j][1] = taps.w;
         }
-#pragma unroll
         for (int part = 0; part < PARTS; part++)
-#pragma unroll
             for (int half = 0; half < 2; half++) {  // of the part's 16 hidden channels
                 int channel = 16 * part + 8 * half + 2 * q;
                 // two channels' four taps each
@@ -116,20 +111,15 @@ DEVICE void convolve_first(Hidden& hidden, const Columns (&left)[N / 4],
                            const ForwardWeights<N>& weights) {
     float sums[TILES][4];
     begin_sums(sums, weights.first_bias);
-#pragma unroll
     for (int n = 0; n < N / 4; n++)
-#pragma unroll
         for (int side = 0; side < 2; side++) {
             const Columns& four = side ? right[n] : left[n];
             unsigned int a[4] = {four.rows[0].x, four.rows[1].x, four.rows[0].y, four.rows[1].y};
-#pragma unroll
             for (int j = 0; j < TILES; j++)
                 multiply_add(sums[j], a, weights.first[n][side][j][0],
                              weights.first[n][side][j][1]);
         }
-#pragma unroll
     for (int part = 0; part < PARTS; part++)
-#pragma unroll
         for (int i = 0; i < 4; i++) {
             const float (&tile)[4] = sums[2 * part + (i >> 1)];
             hidden[part][i] = exists ? pack_relu(tile[2 * (i & 1)], tile[2 * (i & 1) + 1]) : 0u;
@@ -140,11 +130,8 @@ DEVICE void convolve_first(Hidden& hidden, const Columns (&left)[N / 4],
 template <int N>
 DEVICE void convolve_second(float (&sums)[TILES][4], const Hidden (&hidden)[2], int first,
                             const ForwardWeights<N>& weights) {
-#pragma unroll
     for (int h = 0; h < 2; h++)
-#pragma unroll
         for (int part = 0; part < PARTS; part++)
-#pragma unroll
             for (int j = 0; j < TILES; j++)
                 multiply_add(sums[j], hidden[h][part], weights.second[first + h][part][j][0],
                              weights.second[first + h][part][j][1]);
@@ -186,9 +173,7 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
         channel += q * p.channel_size;
         auto exists = [&](int n) { return 4 * n + q < p.n_channels; };
         Columns left[N / 4];  // the four columns before those of the step
-#pragma unroll
         for (int n = 0; n < N / 4; n++)
-#pragma unroll
             for (int half = 0; half < 2; half++) {
                 const Bits* at = channel + 8 * half * p.row_size + 4 * n * p.channel_size;
                 left[n].rows[half] = {0u, 0u};
@@ -199,9 +184,7 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
         begin_sums(next_sums, weights.second_bias);
         for (int i = start; i < end; i++) {
             Columns middle[N / 4], right[N / 4];
-#pragma unroll
             for (int n = 0; n < N / 4; n++)
-#pragma unroll
                 for (int half = 0; half < 2; half++) {
                     const Bits* at = channel + 8 * half * p.row_size + 4 * n * p.channel_size;
                     uint4 word = {0u, 0u, 0u, 0u};
@@ -213,12 +196,9 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
             Hidden hidden[2];
             convolve_first<N>(hidden[0], left, middle, 2 * i < n_hidden, weights);
             convolve_first<N>(hidden[1], middle, right, 2 * i + 1 < n_hidden, weights);
-#pragma unroll
             for (int n = 0; n < N / 4; n++)
                 left[n] = right[n];
-#pragma unroll
             for (int j = 0; j < TILES; j++)
-#pragma unroll
                 for (int e = 0; e < 4; e++)
                     sums[j][e] = next_sums[j][e];
             begin_sums(next_sums, weights.second_bias);
@@ -227,9 +207,7 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
             if (i < first)
                 continue;
             convolve_second(sums, hidden, 2, weights);
-#pragma unroll
             for (int j = 0; j < TILES; j++)
-#pragma unroll
                 for (int half = 0; half < 2; half++) {
                     unsigned int pair = pack_relu(sums[j][2 * half], sums[j][2 * half + 1]);
                     Bits* at = outputs + (g + 8 * half) * p.feature_size;
@@ -243,5 +221,5 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
     }
 }
 
-INSTANCE(BOUNDS(2) conv_forward_4, ConvForwardParams, conv_forward<4>)
-INSTANCE(BOUNDS(2) conv_forward_8, ConvForwardParams, conv_forward<8>)
+INSTANCE(__launch_bounds__(THREADS, 2) conv_forward_4, ConvForwardParams, conv_forward<4>)
+INSTANCE(__launch_bounds__(THREADS, 2) conv_forward_8, ConvForwardParams, conv_forward<8>)

@@ -3,11 +3,8 @@
 // A block computes 64 x 64 results, a warp 32 x 32 of them. Steps of 64 numbers of the inner axis
 // are copied to shared memory, one while the one before is multiplied. A matrix is copied as it is
 // in memory, and transposed as it is loaded from there.
-#include "bits.h"
-#include "constants.h"
-#include "params.h"
-#include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
+#include "params.h"
 
 constexpr int ROW = TILE + 8;  // numbers from a row to the next, so that rows are in other banks
 constexpr int MATRIX = TILE * ROW;
@@ -29,7 +26,6 @@ struct Side {
 // transposed. What does not exist is 0.
 template <bool is_transposed>
 DEVICE void begin_matrix(Bits* target, const Side& side, int first_inner, int end) {
-#pragma unroll
     for (int i = threadIdx.x; i < TILE * TILE / 8; i += TILE_THREADS) {
         int row = i / (TILE / 8), column = i % (TILE / 8) * 8;
         int outer = side.first + (is_transposed ? column : row);
@@ -100,10 +96,8 @@ DEVICE void multiply(const ProductParams& p) {
         begin(step + 1);
         wait_for_copies<1>();
         __syncthreads();
-#pragma unroll
         for (int k = 0; k < TILE; k += 16) {
             unsigned int rows[2][4], columns[4][2];
-#pragma unroll
             for (int i = 0; i < 2; i++) {
                 unsigned int near[2], far[2];
                 load_square<false, false>(near, far, matrix(step, 0), row + 16 * i, k);
@@ -112,13 +106,10 @@ DEVICE void multiply(const ProductParams& p) {
                 rows[i][2] = far[0];
                 rows[i][3] = far[1];
             }
-#pragma unroll
             for (int j = 0; j < 4; j += 2)
                 load_square<is_right_transposed, true>(columns[j], columns[j + 1], matrix(step, 1),
                                                        column + 8 * j, k);
-#pragma unroll
             for (int i = 0; i < 2; i++)
-#pragma unroll
                 for (int j = 0; j < 4; j++)
                     multiply_add(sums[i][j], rows[i], columns[j][0], columns[j][1]);
         }
@@ -128,7 +119,6 @@ DEVICE void multiply(const ProductParams& p) {
     column += right.first + 2 * q;
 #pragma unroll
     for (int i = 0; i < 2; i++)
-#pragma unroll
         for (int j = 0; j < 4; j++) {
             const float (&x)[4] = sums[i][j];
             write_results(p, row + 16 * i, column + 8 * j, x[0], x[1]);
@@ -137,6 +127,6 @@ DEVICE void multiply(const ProductParams& p) {
 }
 
 // Of a layer: inputs, and weights (N, K).
-INSTANCE(BOUNDS(128) product_of_layer, ProductParams, multiply<false>)
+INSTANCE(__launch_bounds__(128) product_of_layer, ProductParams, multiply<false>)
 // Of the inputs' gradient: that of the outputs, and weights (K, N).
-INSTANCE(BOUNDS(128) product_of_inputs, ProductParams, multiply<true>)
+INSTANCE(__launch_bounds__(128) product_of_inputs, ProductParams, multiply<true>)

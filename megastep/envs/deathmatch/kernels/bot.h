@@ -1,8 +1,8 @@
 // The scripted bot: turns until another agent is at the centre of its view, keeps it there and
 // approaches. If it sees none, it walks about and turns away from walls.
 #pragma once
+#include "common/group.h"
 #include "common/math.h"
-#include "constants.h"
 #include "params.h"
 
 constexpr int NO_PIXEL = 0x7fffffff;
@@ -14,13 +14,13 @@ struct Glance {
     int is_blocked;   // whether a wall near the centre is too near to walk
 };
 
-// What every step-th pixel from the first on shows.
-HD Glance glance(const BotParams& p, int lane, int first, int step) {
+template <class Group>
+HD Glance glance(const BotParams& p, const Group& group, int lane) {
     const unsigned short* rgb = p.rgb + 3ll * p.n_pixels * lane;
     const unsigned short* depth = p.depth + (long long)p.n_pixels * lane;
     int n = p.n_pixels, half = n / 2;
     Glance view = {NO_PIXEL, 0, 0, 0};
-    for (int i = first; i < n; i += step) {
+    for (int i = group.rank; i < n; i += Group::SIZE) {
         float red = HALF_VALUE(rgb[i]), green = HALF_VALUE(rgb[n + i]);
         float blue = HALF_VALUE(rgb[2 * n + i]), away = HALF_VALUE(depth[i]);
         float light = red + green + blue;
@@ -31,7 +31,8 @@ HD Glance glance(const BotParams& p, int lane, int first, int step) {
         view.right += i < half ? 0 : units;
         view.is_blocked |= i >= half - MIDDLE && i < half + MIDDLE && !(away < NEAR);
     }
-    return view;
+    return {reduce_min(group, view.pixel), reduce_add(group, view.left),
+            reduce_add(group, view.right), (int)reduce_or(group, view.is_blocked)};
 }
 
 // The arc tangent in degrees (Cephes' atanf), the same on the CPU and on the GPU.
@@ -66,7 +67,11 @@ HD int turn(float target, float spin, float seconds) {
 }
 
 // Chooses a lane's action from what it sees, and updates its state.
-HD void decide(const BotParams& p, int lane, const Glance& view) {
+template <class Group>
+HD void act(const BotParams& p, const Group& group, int lane) {
+    Glance view = glance(p, group, lane);
+    if (group.rank != 0)
+        return;
     int n = p.n_pixels, is_seen = view.pixel != NO_PIXEL, reset = p.reset[lane];
     int pixel = is_seen ? view.pixel % n : 0;
     float target = atan_degrees((float)(n - 1 - 2 * pixel) / (float)n * p.slope);
@@ -95,3 +100,5 @@ HD void decide(const BotParams& p, int lane, const Glance& view) {
     p.next_around[lane] = around;
     p.next_pushed[lane] = action == FORWARD;
 }
+
+EACH_WARP(bot, BotParams, p.n_lanes, p.n_threads, act(p, group, i))

@@ -3,7 +3,6 @@
 // hit.
 #pragma once
 #include "common/math.h"
-#include "constants.h"
 #include "params.h"
 
 constexpr float MIN_HEALTH = 1e-4f;    // less is a rounding error and counts as 0

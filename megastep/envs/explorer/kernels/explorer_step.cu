@@ -16,18 +16,15 @@ DEVICE int count_left(const ExplorerStepParams& p, int agent, const Runs& runs, 
     for (int first = runs.first + warp_lane; first < runs.end; first += BATCH * WARP) {
         Run run[BATCH];
         int counts[BATCH];
-#pragma unroll
         for (int k = 0; k < BATCH; k++) {
             run[k] = {0.f, 0.f, 0u, 0u};
             if (first + k * WARP < runs.end)
                 run[k] = LOAD((const Run*)p.runs + first + k * WARP);
         }
-#pragma unroll
         for (int k = 0; k < BATCH; k++) {
             counts[k] = run[k].bits ? unseen_of(run[k].word, run[k].bits, seen, last) : 0;
             n_left += counts[k];
         }
-#pragma unroll
         for (int k = 0; binned && k < BATCH; k++)
             if (counts[k])
                 ADD(bins + bin_of(pose, run[k].x, run[k].y), counts[k]);

@@ -312,3 +312,6 @@ HD void hideandseek_env(const HideAndSeekStepParams& p, const Group& group, int 
         things_of(p, env)[k].colour = body.locked ? N_KINDS + body.owner : kind;
     }
 }
+
+EACH_WARP(hideandseek_step, HideAndSeekStepParams, p.scenery.n_envs,
+          threads_for_agents(p.scenery, 256), hideandseek_env(p, group, i))
