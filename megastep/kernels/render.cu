@@ -202,18 +202,13 @@ DEVICE void render_by_warps(const RenderParams& p) {
     NearestLine* nearest = shared + whole_tiles(p.res) * warp;
     if (with_objects)  // whose lines and texels follow
         nearest += 2 * (p.objects.n_lines + p.objects.n_objects) * warp;
-    if (with_objects && may_write_all && p.indices)
-        render_agent<1, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
-    else if (with_objects && p.scenery.n_agents > 1)
-        render_agent<0, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
-    else if (with_objects)
-        render_agent<0, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
-    else if (may_write_all && p.indices)
-        render_agent<1, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    constexpr int objects = with_objects ? OBJECTS : 0;
+    if (may_write_all && p.indices)
+        render_agent<1, AGENTS | objects, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
     else if (p.scenery.n_agents > 1)
-        render_agent<0, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+        render_agent<0, AGENTS | objects, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
     else
-        render_agent<0, 0, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+        render_agent<0, objects, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
 }
 
 static_assert(BLOCK == 2 * WARP, "each of two warps has half_of_screen");

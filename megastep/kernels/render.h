@@ -47,10 +47,6 @@ struct RaySample {
     float red, green, blue, depth;
 };
 
-HD RaySample plus(const RaySample& a, const RaySample& b) {
-    return {a.red + b.red, a.green + b.green, a.blue + b.blue, a.depth + b.depth};
-}
-
 // Writes a ray that hits no line. `ray` is its index over all cameras.
 HD void write_miss(const RenderParams& p, long long ray) {
     if (p.locations)

@@ -1,9 +1,8 @@
 // Looks for numbers of a rollout that are NaN, infinite or too large.
-#include "common/dependent_launch.h"
+#include "common/half.h"
 #include "params.h"
 
-static_assert(sizeof(FindBadParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
-static_assert(sizeof(RecordParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
+static_assert(sizeof(CheckedParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
 
 DEVICE float value_at(const CheckedTensorParams& tensor, long long at) {
     if (!tensor.is_half)

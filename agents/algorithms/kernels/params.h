@@ -16,38 +16,30 @@ constexpr int TD_SEQUENCES = 8;  // of a block, whose numbers fill a sector of 3
 constexpr int N_TD_SUMS = 7;
 constexpr int N_TD_METRICS = 7;
 
-struct GaeParams {
+struct ReturnsParams {
     const float* reward;             // (T, B)
-    const float* values;             // (T, B)
-    const float* last_value;         // (B)
+    const float* values;             // (T, B), of V-trace (T + 1, B)
     const unsigned char* reset;      // (T, B)
     const unsigned char* terminal;   // (T, B)
     const unsigned char* truncated;  // (T, B)
-    const unsigned char* learns;     // (T, B); null: all do
     float* advantages;               // (T, B)
     float* targets;                  // (T, B)
-    unsigned char* valid;            // (T, B)
     const float* gamma;              // ()
     const float* lambda_;            // ()
     int n_steps;
     int n_lanes;
 };
 
-struct VtraceParams {
-    const float* log_ratio;          // (T, B)
-    const float* reward;             // (T, B)
-    const float* values;             // (T + 1, B)
-    const unsigned char* reset;      // (T, B)
-    const unsigned char* terminal;   // (T, B)
-    const unsigned char* truncated;  // (T, B)
-    float* advantages;               // (T, B)
-    float* targets;                  // (T, B)
-    const float* gamma;              // ()
-    const float* lambda_;            // ()
-    const float* rho_clip;           // ()
-    const float* c_clip;             // ()
-    int n_steps;
-    int n_lanes;
+struct GaeParams : ReturnsParams {
+    const float* last_value;      // (B)
+    const unsigned char* learns;  // (T, B); null: all do
+    unsigned char* valid;         // (T, B)
+};
+
+struct VtraceParams : ReturnsParams {
+    const float* log_ratio;  // (T, B)
+    const float* rho_clip;   // ()
+    const float* c_clip;     // ()
 };
 
 struct PpoLossParams {
@@ -172,22 +164,19 @@ struct CheckedTensorParams {
 };
 
 // A row is a step of a tensor, in the order (T + 1, n_tensors).
-
-struct FindBadParams {
+struct CheckedParams {
     CheckedTensorParams tensors[16];
     int* first_rows;  // (B), the first row with a number above the limit; larger if there is none
     int n_tensors;
     int n_steps;  // T + 1
     int n_lanes;
+};
+
+struct FindBadParams : CheckedParams {
     float limit;
 };
 
-struct RecordParams {
-    CheckedTensorParams tensors[16];
-    const int* first_rows;     // (B)
+struct RecordParams : CheckedParams {
     double* record;            // see NonFiniteCheck
     unsigned char* is_finite;  // ()
-    int n_tensors;
-    int n_steps;  // T + 1
-    int n_lanes;
 };

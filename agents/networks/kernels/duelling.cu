@@ -27,7 +27,7 @@ DEVICE float sum_of_own(float (&sums)[WARP]) {
 
 // The products of half of the hidden layer, from `offset`, with `n_outputs` rows of a weight.
 // Thread OUTPUTS i + k returns that of row i and output k.
-DEVICE float products(const DuellingParams& p, const long long (&rows)[ROWS], int offset,
+DEVICE float products(const DuellingForwardParams& p, const long long (&rows)[ROWS], int offset,
                       const float* weight, int n_outputs) {
     float sums[WARP] = {};
     for (int first = N * (threadIdx.x % WARP); first < p.width; first += N * WARP) {
@@ -54,7 +54,7 @@ struct Part {
     bool exists;
 };
 
-DEVICE Part find_part(const DuellingParams& p) {
+DEVICE Part find_part(const DuellingForwardParams& p) {
     int lane = threadIdx.x % WARP, n_outputs = p.n_agents * p.n_choices;
     int first = (blockIdx.x * blockDim.x + threadIdx.x) / WARP * ROWS;
     Part part;
@@ -68,7 +68,7 @@ DEVICE Part find_part(const DuellingParams& p) {
 }
 
 // The value of the thread's choice. Writes it, too.
-DEVICE float value_of(const DuellingParams& p, const Part& me) {
+DEVICE float value_of(const DuellingForwardParams& p, const Part& me) {
     int n_outputs = p.n_agents * p.n_choices, last = n_outputs - 1;
     float value = products(p, me.rows, 0, p.value_weight, p.n_agents);
     float advantage = products(p, me.rows, p.width, p.advantage_weight, n_outputs);
@@ -85,12 +85,12 @@ DEVICE float value_of(const DuellingParams& p, const Part& me) {
     return value;
 }
 
-KERNEL __launch_bounds__(64) duelling_values(DuellingParams p) {
+KERNEL __launch_bounds__(64) duelling_values(DuellingForwardParams p) {
     wait_for_previous();
     value_of(p, find_part(p));
 }
 
-KERNEL __launch_bounds__(64) duelling_act(DuellingParams p) {
+KERNEL __launch_bounds__(64) duelling_act(DuellingForwardParams p) {
     wait_for_previous();
     Part me = find_part(p);
     float value = value_of(p, me), best_value = 0.f, logprob = 0.f;

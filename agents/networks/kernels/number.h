@@ -1,7 +1,7 @@
 // Reading and writing float32 and bfloat16 numbers, several at once.
 #pragma once
 #include "common/constants.h"
-#include "common/dependent_launch.h"
+#include "common/half.h"
 
 // The upper half of a float. Not cuda_bf16.h, so NVRTC needs no include folder.
 struct Bfloat16 {

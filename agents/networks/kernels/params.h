@@ -25,38 +25,33 @@ constexpr float RESOLUTION = 1e-5f;     // of a mean, which rounding errors stay
 // The minGRU. Gates are the update gate before activation, and the candidate. `start` is the state
 // before the first step, `last` the state after the last.
 
-struct MingruForwardParams {
+struct MingruParams {
     const void* gates;           // (T, B, 2 W) compute
     const unsigned char* reset;  // (T, B)
     const float* start;          // (B, W)
-    const void* residual;        // (T, B, W) compute, added to `outputs`; null: nothing is
-    void* states;                // (T, B, W) compute, the outputs without the residual; null: not
-                                 // wanted
-    void* outputs;               // (T, B, W) compute
-    float* last;                 // (B, W)
+    void* states;                // (T, B, W) compute, the outputs without the residual; null when
+                                 // forward: not wanted
     int n_steps;
     int n_lanes;
     int width;
     int n_units;  // units per thread
 };
 
-struct MingruBackwardParams {
-    const void* gates;           // (T, B, 2 W) compute
-    const unsigned char* reset;  // (T, B)
-    const float* start;          // (B, W)
-    const void* states;          // (T, B, W) compute
-    const void* d_outputs;       // (T, B, W) compute
-    const float* d_last;         // (B, W); null: zeros
-    void* d_gates;               // (T, B, 2 W) compute
-    float* d_start;              // (B, W); null: not wanted
-    void* d_residual;            // (T, B, W) compute, a copy of d_outputs; null: not wanted
-    float* d_biases;  // (blocks, 2 W) d_gates summed over a block's lanes and all steps; or
-                      // (B, 2 W), only over steps
-    int n_steps;
-    int n_lanes;
-    int width;
-    int n_units;     // units per thread
-    int adds_lanes;  // a block has whole lanes, and d_biases a row per block
+struct MingruForwardParams : MingruParams {
+    const void* residual;  // (T, B, W) compute, added to `outputs`; null: nothing is
+    void* outputs;         // (T, B, W) compute
+    float* last;           // (B, W)
+};
+
+struct MingruBackwardParams : MingruParams {
+    const void* d_outputs;  // (T, B, W) compute
+    const float* d_last;    // (B, W); null: zeros
+    void* d_gates;          // (T, B, 2 W) compute
+    float* d_start;         // (B, W); null: not wanted
+    void* d_residual;       // (T, B, W) compute, a copy of d_outputs; null: not wanted
+    float* d_biases;        // (blocks, 2 W) d_gates summed over a block's lanes and all steps; or
+                            // (B, 2 W), only over steps
+    int adds_lanes;         // a block has whole lanes, and d_biases a row per block
 };
 
 // ---- Layers ----
@@ -190,18 +185,12 @@ struct CategoricalActParams {
 // The heads of an update. A row of their product has the prediction, the actions' scores, and the
 // critic's hidden layer of W units before its ReLU, each padded to a multiple of 8. W = 8 without
 // such a layer: then the value is the first of these columns.
-struct HeadsForwardParams {
+struct HeadsParams {
     const void* product;        // (n_rows, n_columns) bfloat16
     const void* target;         // (n_rows, n_predicted, padded) bfloat16, of the prediction
     const long long* actions;   // (n_rows, A)
     const float* value_weight;  // (W); null: there is no hidden layer
-    const float* value_bias;    // (); null: 0
     const float* value_scale;   // ()
-    const float* value_mean;    // ()
-    float* logprobs;            // (n_rows), of the joint actions; null: not wanted
-    float* entropies;           // (n_rows)
-    float* errors;              // (n_rows), of the prediction; null: not wanted
-    float* values;              // (n_rows)
     int n_rows;                 // at most 2^31 - STRIP
     int n_predicted;
     int n_agents;
@@ -209,12 +198,16 @@ struct HeadsForwardParams {
     int width;  // a multiple of 8
 };
 
-struct HeadsBackwardParams {
-    const void* product;
-    const void* target;
-    const long long* actions;
-    const float* value_weight;
-    const float* value_scale;
+struct HeadsForwardParams : HeadsParams {
+    const float* value_bias;  // (); null: 0
+    const float* value_mean;  // ()
+    float* logprobs;          // (n_rows), of the joint actions; null: not wanted
+    float* entropies;         // (n_rows)
+    float* errors;            // (n_rows), of the prediction; null: not wanted
+    float* values;            // (n_rows)
+};
+
+struct HeadsBackwardParams : HeadsParams {
     const float* d_logprobs;   // (n_rows)
     const float* d_entropies;  // (n_rows)
     const float* d_errors;     // (n_rows)
@@ -222,82 +215,67 @@ struct HeadsBackwardParams {
     void* d_product;           // (n_rows, n_columns) bfloat16
     float* sums;               // (n_strips, n_columns + W + 8), of d_product, and the gradients
                                // of the value's weight and bias, over STRIP rows each
-    int n_rows;
-    int n_predicted;
-    int n_agents;
-    int n_choices;
-    int width;
 };
 
 struct DuellingParams {
-    const void* hidden;             // (n_rows, 2 W) bfloat16
+    const void* hidden;             // (n_rows, 2 W) bfloat16, after the ReLU
     const float* value_weight;      // (A, W)
-    const float* value_bias;        // (A)
     const float* advantage_weight;  // (A n, W)
-    const float* advantage_bias;    // (A n)
-    const float* noise;             // (2, n_rows, A) from 0 to 1; null: no random actions
-    const float* epsilon;           // (n_rows); null: `usual_epsilon`
-    float* values;                  // (n_rows, A, n)
-    long long* actions;             // (n_rows, A); null unless acting, like `logprobs`
-    float* logprobs;                // (n_rows), of the joint actions with `usual_epsilon`
     int n_rows;
     int width;      // a multiple of 8
     int n_agents;   // A
     int n_choices;  // A n is at most DUELLING_OUTPUTS
+};
+
+struct DuellingForwardParams : DuellingParams {
+    const float* value_bias;      // (A)
+    const float* advantage_bias;  // (A n)
+    const float* noise;           // (2, n_rows, A) from 0 to 1; null: no random actions
+    const float* epsilon;         // (n_rows); null: `usual_epsilon`
+    float* values;                // (n_rows, A, n)
+    long long* actions;           // (n_rows, A); null unless acting, like `logprobs`
+    float* logprobs;              // (n_rows), of the joint actions with `usual_epsilon`
     float usual_epsilon;
 };
 
-struct DuellingBackwardParams {
-    const void* hidden;             // (n_rows, 2 W) bfloat16, after the ReLU
-    const float* value_weight;      // (A, W)
-    const float* advantage_weight;  // (A n, W)
-    const float* d_values;          // (n_rows, A, n)
-    void* d_hidden;                 // (n_rows, 2 W) bfloat16, before the ReLU
-    float* sums;                    // (n_strips, n_sums); see the kernel
-    int n_rows;
-    int width;
-    int n_agents;
-    int n_choices;
-    int n_sums;  // (2 + A + A n) W + A + A n
+struct DuellingBackwardParams : DuellingParams {
+    const float* d_values;  // (n_rows, A, n)
+    void* d_hidden;         // (n_rows, 2 W) bfloat16, before the ReLU
+    float* sums;            // (n_strips, n_sums); see the kernel
+    int n_sums;             // (2 + A + A n) W + A + A n
 };
 
 // The LSTM over a whole sequence, on the CPU. Everything is float32, W is a multiple of 16.
 
-struct LstmSequenceForwardParams {
-    const float* x;              // (T, B, W)
+struct LstmSequenceParams {
     const float* input_weight;   // (4 W, W)
-    const float* bias;           // (4 W)
     const float* weight;         // (4 W, W) of the recurrent product
     const unsigned char* reset;  // (T, B) clears a lane's output and cell before the step
-    const float* first_output;   // (B, W) before the sequence
-    const float* first_cell;     // (B, W)
-    float* gates;                // (T, B, 4 W) out: after activation
-    float* hiddens;              // (T, B, W) out: the last step's output as a step sees it
-    float* cells;                // (T, B, W) out: the last step's cell as a step sees it
-    float* outputs;              // (T, B, W) out
-    float* last_cell;            // (B, W) out
+    float* gates;                // (T, B, 4 W) out when forward, as the next: after activation
+    float* cells;                // (T, B, W) the last step's cell as a step sees it
     int n_steps;
     int n_lanes;
     int width;
     int n_threads;
 };
 
-struct LstmSequenceBackwardParams {
-    const float* input_weight;   // (4 W, W)
-    const float* weight;         // (4 W, W)
-    const unsigned char* reset;  // (T, B)
-    const float* gates;          // (T, B, 4 W) after activation
-    const float* cells;          // (T, B, W)
-    const float* d_outputs;      // (T, B, W)
-    const float* d_last_cell;    // (B, W)
-    float* d_gates;              // (T, B, 4 W) out: before activation
-    float* d_x;                  // (T, B, W) out
-    float* d_output;             // (B, W) out: of the output before the sequence
-    float* d_cell;               // (B, W) out
-    int n_steps;
-    int n_lanes;
-    int width;
-    int n_threads;
+struct LstmSequenceForwardParams : LstmSequenceParams {
+    const float* x;             // (T, B, W)
+    const float* bias;          // (4 W)
+    const float* first_output;  // (B, W) before the sequence
+    const float* first_cell;    // (B, W)
+    float* hiddens;             // (T, B, W) out: the last step's output as a step sees it
+    float* outputs;             // (T, B, W) out
+    float* last_cell;           // (B, W) out
+};
+
+struct LstmSequenceBackwardParams : LstmSequenceParams {
+    const float* d_outputs;    // (T, B, W)
+    const float* d_last_cell;  // (B, W)
+    float* d_gates;            // (T, B, 4 W) out: before activation
+    float* d_x;                // (T, B, W) out
+    float* d_output;           // (B, W) out: of the output before the sequence
+    float* d_cell;             // (B, W) out
 };
 
 // A matrix product on the CPU: out = a b. Rows and columns of a and b are so many floats apart.

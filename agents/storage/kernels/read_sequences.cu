@@ -1,5 +1,7 @@
 // Reads sequences from the replay buffer, one thread per word. The first block computes the
 // importance weights, the next ones read the flags, then those of each tensor follow.
+#include "common/backend.h"
+#include "common/rows.h"
 #include "common/sums.h"
 #include "params.h"
 
@@ -31,27 +33,13 @@ DEVICE void read_word(const ReadSequencesParams& p, const ReadTensorParams& tens
     if (t >= tensor.n_rows)
         return;
     long long from = entry(p, sequence, t, tensor.rows_per_rollout) * tensor.n_words + word;
-    const void* source = tensor.source;
-    void* target = tensor.target;
-    switch (tensor.word_size) {
-        case 16:
-            ((uint4*)target)[at] = ((const uint4*)source)[from];
-            break;
-        case 8:
-            ((uint2*)target)[at] = ((const uint2*)source)[from];
-            break;
-        case 4:
-            ((unsigned int*)target)[at] = ((const unsigned int*)source)[from];
-            break;
-        case 2:
-            ((unsigned short*)target)[at] = ((const unsigned short*)source)[from];
-            break;
-        case 1:
-            ((unsigned char*)target)[at] = ((const unsigned char*)source)[from];
-            break;
-        default:
-            ((float*)target)[at] = half_value(((const unsigned short*)source)[from]);
-    }
+    if (!tensor.word_size)
+        ((float*)tensor.target)[at] = HALF_VALUE(((const unsigned short*)tensor.source)[from]);
+    else
+        with_word(tensor.word_size, [&](auto word) {
+            typedef decltype(word) Word;
+            ((Word*)tensor.target)[at] = ((const Word*)tensor.source)[from];
+        });
 }
 
 DEVICE void read_flags(const ReadSequencesParams& p, unsigned int at) {

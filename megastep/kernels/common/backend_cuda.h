@@ -1,7 +1,7 @@
 // The macros of backend.h on the GPU.
 #pragma once
 #include "common/constants.h"
-#include "common/dependent_launch.h"
+#include "common/half.h"
 
 #define HAS_THREADS
 #define HD static __device__ __forceinline__

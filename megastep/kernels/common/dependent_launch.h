@@ -25,13 +25,6 @@ DEVICE void wait_for_previous() {
 #endif
 }
 
-// fp16 without cuda_fp16.h: NVRTC then needs no include folder.
-DEVICE float half_value(unsigned short bits) {
-    float x;
-    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(bits));
-    return x;
-}
-
 // A kernel that does what one function does, such as an instance of a template.
 #define INSTANCE(operation, Params, ...) \
     KERNEL operation(Params p) {         \

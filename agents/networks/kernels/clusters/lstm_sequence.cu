@@ -110,6 +110,16 @@ DEVICE void write_floats(float* target, uint4 bits) {
                             high_half(bits.w)};
 }
 
+// Announces what comes of even and odd steps, of both groups: so many bytes per lane.
+DEVICE void init_arrivals(Arrivals (&arrivals)[2][2], int n_bytes) {
+    for (int i = 0; i < 2; i++) {
+        init(&arrivals[i][0]);
+        expect(&arrivals[i][0], n_bytes * Group<0>::LANES);
+        init(&arrivals[i][1]);
+        expect(&arrivals[i][1], n_bytes * Group<1>::LANES);
+    }
+}
+
 // ---- Forward ----
 
 constexpr int STAGES = 3;  // steps whose gates are in shared memory
@@ -195,14 +205,8 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
             cells[j][e] = reset[lane] ? 0.f : p.last_cell[(long long)lane * W + unit];
         }
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
-    if (!me.index) {
-        for (int i = 0; i < 2; i++) {
-            init(&memory.arrivals[i][0]);
-            expect(&memory.arrivals[i][0], RANKS * SENT * Group<0>::LANES);
-            init(&memory.arrivals[i][1]);
-            expect(&memory.arrivals[i][1], RANKS * SENT * Group<1>::LANES);
-        }
-    }
+    if (!me.index)
+        init_arrivals(memory.arrivals, RANKS * SENT);
     wait_for_copies<1>();
     cluster_barrier();
 
@@ -387,14 +391,8 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     load_saved(n_steps - 1, Group<0>());
     load_saved(n_steps - 1, Group<1>());
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
-    if (!me.index) {
-        for (int i = 0; i < 2; i++) {
-            init(&memory.arrivals[i][0]);
-            expect(&memory.arrivals[i][0], RANKS * SENT * Group<0>::LANES);
-            init(&memory.arrivals[i][1]);
-            expect(&memory.arrivals[i][1], RANKS * SENT * Group<1>::LANES);
-        }
-    }
+    if (!me.index)
+        init_arrivals(memory.arrivals, RANKS * SENT);
     wait_for_copies<0>();
     cluster_barrier();
 

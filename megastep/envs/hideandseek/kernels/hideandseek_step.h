@@ -5,7 +5,16 @@
 #include "common/line_of_sight.h"
 #include "common/philox.h"
 #include "common/step.h"
-#include "constants.h"
+
+constexpr int GRAB = 7;     // actions beside the moves: grab a body or let go
+constexpr int LOCK = 8;     // lock or unlock a body
+constexpr int N_KINDS = 3;  // of bodies, each with a colour; those of the teams' locks come next
+constexpr int STATE = 9;    // numbers that an agent observes beside images
+constexpr int TALLY = 5;    // of an episode so far: steps unseen, and four of PHASE
+constexpr int PHASE = 4;    // box moved and locked, ramp moved and locked
+constexpr int METRICS = 9;  // steps unseen, and PHASE at the end of either phase
+constexpr int PRIVILEGED_PER_AGENT = 5;  // numbers that a critic sees of each other agent
+constexpr int PRIVILEGED_PER_BODY = 7;
 
 // N environments of A agents, hiders first, and K bodies: boxes, elongated ones, ramps. D layouts,
 // M starts per layout. Positions are written where an episode starts. Metrics: the fraction of the
@@ -315,3 +324,45 @@ HD void hideandseek_env(const HideAndSeekStepParams& p, const Group& group, int 
 
 EACH_WARP(hideandseek_step, HideAndSeekStepParams, p.scenery.n_envs,
           threads_for_agents(p.scenery, 256), hideandseek_env(p, group, i))
+
+// ---- Before and after a step ----
+
+// The actions of B lanes as agents move by them: 0 of those that cannot move, or do not.
+struct HideAndSeekMovesParams {
+    const long long* actions;    // (B)
+    const int* ages;             // (B)
+    const unsigned char* ended;  // (B)
+    long long* out;              // (B)
+    int n_lanes;                 // B
+    int n_agents;                // A
+    int n_hiders;
+    int prep;
+};
+
+// Returns 1 if an action of lane i moves it.
+HD int is_move(const HideAndSeekMovesParams& p, int i) {
+    int waits = p.ages[i] < p.prep && i % p.n_agents >= p.n_hiders;
+    return !p.ended[i] && !waits && p.actions[i] < GRAB;
+}
+
+EACH(hideandseek_moves, HideAndSeekMovesParams, p.n_lanes, 1,
+     p.out[i] = is_move(p, i) ? p.actions[i] : 0)
+
+// B lanes, R pixels. The images of seekers that wait are black.
+struct HideAndSeekImagesParams {
+    const unsigned char* blind;  // (B)
+    unsigned short* rgb;         // (B, 3, R) fp16: set to 0 where blind
+    unsigned short* depth;       // (B, R) likewise
+    int n_lanes;                 // B
+    int n_pixels;                // R
+};
+
+HD void blacken(const HideAndSeekImagesParams& p, int lane) {
+    int n = p.n_pixels;
+    for (int i = 0; i < 3 * n && p.blind[lane]; i++)
+        p.rgb[3ll * n * lane + i] = 0;
+    for (int i = 0; i < n && p.blind[lane]; i++)
+        p.depth[(long long)n * lane + i] = 0;
+}
+
+EACH(hideandseek_images, HideAndSeekImagesParams, p.n_lanes, 1, blacken(p, i))
