@@ -1,6 +1,5 @@
 // Irradiance: ambient light, and the light of each lamp that no wall of the layout occludes.
 #pragma once
-#include "common/math.h"
 #include "common/scenery.h"
 
 constexpr float AMBIENT = 0.1f;

@@ -6,7 +6,6 @@
 // pixels per camera. W walls and T texels of all layouts together. B lanes.
 #pragma once
 #include "common/objects.h"
-#include "common/scenery.h"
 
 struct BakeParams {
     SceneryParams scenery;

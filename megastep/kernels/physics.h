@@ -2,7 +2,6 @@
 // another agent's disc.
 #pragma once
 #include "common/collision.h"
-#include "common/errors.h"
 #include "params.h"
 
 constexpr float INFLATION = 1.001f;  // of the radius: a stopped camera stays on its side of a wall

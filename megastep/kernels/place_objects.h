@@ -26,16 +26,6 @@ HD int fits(const PlaceObjectsParams& p, int env, int i, float x, float y) {
     return 1;
 }
 
-// Stops a body that is put elsewhere, and frees it.
-HD void rest(Body& body) {
-    body.vx = 0.f;
-    body.vy = 0.f;
-    body.turning = 0.f;
-    body.holder = -1;
-    body.owner = -1;
-    body.locked = 0;
-}
-
 // Places the masked objects of an environment one after the other, each at the first point that
 // fits, counted from a random one, with a random angle. One that fits nowhere is flagged, and put
 // at the random point.

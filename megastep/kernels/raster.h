@@ -1,7 +1,6 @@
 // Rasterising in one dimension. A line covers an interval of pixels, and along it inverse depth is
 // an affine function of the pixel's index. In a camera's frame x is depth and y points left.
 #pragma once
-#include "common/math.h"
 #include "params.h"
 
 constexpr int MAX_RES = 1024;          // rays per camera: 32 tiles of 32 pixels

@@ -3,9 +3,7 @@
 // that the group covers: each warp lane takes one pixel and keeps, of the lines that cover it, the
 // one with the largest inverse depth, or the first of equals.
 #pragma once
-#include "raster.h"
 #include "render.h"
-#include "shading.h"
 
 constexpr int TILE = WARP;  // pixels
 static_assert(MAX_RES == TILE * WARP, "warp lane k holds tile_min of tile k");

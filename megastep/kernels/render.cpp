@@ -3,8 +3,6 @@
 #include <algorithm>
 #include <vector>
 
-#include "common/errors.h"
-#include "common/scenery.h"
 #include "render.h"
 
 // Four floats in one register, as a texel (red, green, blue, light) or a ray's sample (red, green,

@@ -1,8 +1,5 @@
 // The outputs of `render`: rays at full resolution, pixels (means of rays), newly seen texels, IMU.
 #pragma once
-#include "common/math.h"
-#include "params.h"
-#include "raster.h"
 #include "shading.h"
 
 // Writes component k of an agent's IMU: angular velocity / 360, own velocity ahead / 10 and left

@@ -1,7 +1,6 @@
 // Ranges of a lidar: the nearest wall along each ray, a thread per ray. Ray 0 looks ahead, the
 // others follow counter-clockwise.
 #pragma once
-#include "common/math.h"
 #include "params.h"
 
 // A ray from (x, y) along the unit vector (dx, dy).

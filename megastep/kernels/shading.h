@@ -1,8 +1,6 @@
 // Shading: where a ray hits a line, at which angle, and the colour there.
 #pragma once
-#include "common/math.h"
 #include "draw_objects.h"
-#include "params.h"
 #include "raster.h"
 
 // One environment's lines and texels.

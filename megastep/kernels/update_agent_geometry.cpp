@@ -1,6 +1,5 @@
 // A loop over agents: moves their models to their poses and, if `lit`, lights their texels.
 #include "update_agent_geometry.h"
-#include "common/scenery.h"
 
 static void light_agent(const UpdateAgentGeometryParams& p, int env, int a) {
     const SceneryParams& s = p.scenery;

@@ -1,7 +1,5 @@
 // Positions of an agent's lines and texels.
 #pragma once
-#include "common/math.h"
-#include "common/scenery.h"
 #include "light.h"
 #include "params.h"
 

@@ -2,7 +2,6 @@
 #pragma once
 #include "draw_objects.h"
 #include "light.h"
-#include "params.h"
 
 constexpr int NOBODY = -2;  // no agent, nor a carrier
 

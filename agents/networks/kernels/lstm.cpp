@@ -3,7 +3,6 @@
 // the output.
 #include <memory>
 
-#include "common/math.h"
 #include "params.h"
 #include "vector.h"
 
@@ -13,17 +12,6 @@ template <class Params>
 static int threads_of(const Params& p) {
     long long size = (long long)p.n_steps * p.n_lanes * p.width * p.width;
     return size < 1 << 22 ? 1 : p.n_threads;
-}
-
-// Calls f with the lanes [first, end) of each thread.
-template <class F>
-static void on_threads(int n_lanes, int n_threads, F f) {
-    int n_tiles = (n_lanes + ROWS - 1) / ROWS;
-#pragma omp parallel for schedule(static) num_threads(n_threads)
-    for (int i = 0; i < n_threads; i++) {
-        int first = ROWS * (int)((long long)n_tiles * i / n_threads);
-        f(first, mini(ROWS * (int)((long long)n_tiles * (i + 1) / n_threads), n_lanes));
-    }
 }
 
 // Calls tile<N>(lane), which does N lanes, for the lanes [first, end).
@@ -131,7 +119,7 @@ KERNEL lstm_sequence_forward(const LstmSequenceForwardParams& p) {
 #pragma omp parallel for schedule(static) num_threads(n_threads)
     for (int unit = 0; unit < w; unit += SIZE)
         pack(p, unit, packed + 8LL * w * unit);
-    on_threads(p.n_lanes, n_threads,
+    on_threads(p.n_lanes, ROWS, n_threads,
                [&](int first, int end) { forward_lanes(p, packed, first, end); });
 }
 
@@ -224,6 +212,6 @@ static void backward_lanes(const LstmSequenceBackwardParams& p, int first, int e
 }
 
 KERNEL lstm_sequence_backward(const LstmSequenceBackwardParams& p) {
-    on_threads(p.n_lanes, threads_of(p),
+    on_threads(p.n_lanes, ROWS, threads_of(p),
                [&](int first, int end) { backward_lanes(p, first, end); });
 }

@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <memory>
 
-#include "common/math.h"
 #include "params.h"
 #include "vector.h"
 
@@ -115,12 +114,8 @@ static void multiply(const MatmulParams& p, int row, int last_row, float* packed
 }
 
 KERNEL matmul(const MatmulParams& p) {
-    int n_tiles = (p.n_rows + TILE_ROWS - 1) / TILE_ROWS, n_threads = threads_of(p);
-#pragma omp parallel for schedule(static) num_threads(n_threads)
-    for (int i = 0; i < n_threads; i++) {
+    on_threads(p.n_rows, TILE_ROWS, threads_of(p), [&](int first, int end) {
         std::unique_ptr<Vector[]> packed(new Vector[DEPTH * WIDE]);
-        int first = TILE_ROWS * (int)((long long)n_tiles * i / n_threads);
-        int end = mini(TILE_ROWS * (int)((long long)n_tiles * (i + 1) / n_threads), p.n_rows);
         multiply(p, first, end, (float*)packed.get());
-    }
+    });
 }

@@ -1,5 +1,6 @@
 // Vectors of floats on the CPU, and the gates' activations.
 #pragma once
+#include "common/math.h"
 
 #ifdef __FMA__
 #include <immintrin.h>
@@ -59,3 +60,14 @@ static inline Vector exp_of(Vector x) {
 static inline Vector sigmoid(Vector x) { return 1.f / (1.f + exp_of(-x)); }
 
 static inline Vector tanh_of(Vector x) { return 1.f - 2.f / (1.f + exp_of(2.f * x)); }
+
+// Calls f with the rows [first, end) of each thread, whole tiles but for the last.
+template <class F>
+static void on_threads(int n_rows, int tile_rows, int n_threads, F f) {
+    int n_tiles = (n_rows + tile_rows - 1) / tile_rows;
+#pragma omp parallel for schedule(static) num_threads(n_threads)
+    for (int i = 0; i < n_threads; i++) {
+        int first = tile_rows * (int)((long long)n_tiles * i / n_threads);
+        f(first, mini(tile_rows * (int)((long long)n_tiles * (i + 1) / n_threads), n_rows));
+    }
+}

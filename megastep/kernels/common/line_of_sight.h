@@ -16,8 +16,21 @@ HD int cuts(float ax, float ay, float bx, float by, float x, float y, float dx, 
            (cross(dx, dy, vx, vy) != 0.f);
 }
 
-// The lines of sight, of three, that environment `env`'s obstacles cut: a bit for each. The lines
-// run from (x, y) to (x + dx, y + dy) and to both sides of it.
+// The three lines of sight, from (x, y) to (x + dx, y + dy) and to both sides of it, that a wall
+// cuts: a bit for each.
+HD unsigned int cut_by(const Float4& wall, float x, float y, float dx, float dy, float side_x,
+                       float side_y) {
+    unsigned int cut = 0;
+    for (int line = 0; line < 3; line++) {
+        float aside = (float)(line - 1);
+        cut |= (unsigned int)cuts(wall.x, wall.y, wall.z, wall.w, x, y, dx + aside * side_x,
+                                  dy + aside * side_y)
+               << line;
+    }
+    return cut;
+}
+
+// The lines of sight that environment `env`'s obstacles cut.
 template <class Group>
 HD unsigned int cut_by_objects(const ObjectsParams& o, const Group& group, int env, float x,
                                float y, float dx, float dy, float side_x, float side_y) {
@@ -28,15 +41,8 @@ HD unsigned int cut_by_objects(const ObjectsParams& o, const Group& group, int e
             continue;
         Pose pose = pose_at(object.x, object.y, object.angle);
         Lines lines = lines_of(o, k);
-        for (int l = lines.first; l < lines.end; l++) {
-            Float4 side = line_of(o, l, object, pose);
-            for (int line = 0; line < 3; line++) {
-                float aside = (float)(line - 1);
-                cut |= (unsigned int)cuts(side.x, side.y, side.z, side.w, x, y, dx + aside * side_x,
-                                          dy + aside * side_y)
-                       << line;
-            }
-        }
+        for (int l = lines.first; l < lines.end; l++)
+            cut |= cut_by(line_of(o, l, object, pose), x, y, dx, dy, side_x, side_y);
     }
     return cut;
 }
@@ -49,15 +55,8 @@ HD int is_visible(const SceneryParams& s, const ObjectsParams& o, const Group& g
     float wide = s.radius / maxf(SQRT(dx * dx + dy * dy), s.radius);
     float side_x = -wide * dy, side_y = wide * dx;
     unsigned int cut = 0;
-    for (int i = walls.first_wall + group.rank; i < walls.end_wall && cut != 7; i += Group::SIZE) {
-        Float4 wall = LOAD((const Float4*)s.walls + i);
-        for (int line = 0; line < 3; line++) {
-            float aside = (float)(line - 1);
-            cut |= (unsigned int)cuts(wall.x, wall.y, wall.z, wall.w, x, y, dx + aside * side_x,
-                                      dy + aside * side_y)
-                   << line;
-        }
-    }
+    for (int i = walls.first_wall + group.rank; i < walls.end_wall && cut != 7; i += Group::SIZE)
+        cut |= cut_by(LOAD((const Float4*)s.walls + i), x, y, dx, dy, side_x, side_y);
     if (with_objects)
         cut |= cut_by_objects(o, group, env, x, y, dx, dy, side_x, side_y);
     return reduce_or(group, cut) != 7;

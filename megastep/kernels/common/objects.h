@@ -2,7 +2,6 @@
 //
 // N environments, O objects per environment, L lines of one environment's objects, P colours.
 #pragma once
-#include "common/math.h"
 #include "common/scenery.h"
 
 // An object, in 32 bytes that are read at once. Python's tensors of objects are views of its
@@ -62,6 +61,13 @@ struct ObjectsParams {
 HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
 
 HD Body* bodies_of(const ObjectsParams& o) { return (Body*)o.bodies; }
+
+// Stops a body that is put elsewhere, and frees it.
+HD void rest(Body& body) {
+    body.vx = body.vy = body.turning = 0.f;
+    body.holder = body.owner = -1;
+    body.locked = 0;
+}
 
 // The object that an environment's body k is.
 HD int object_of_body(const ObjectsParams& o, int k) {

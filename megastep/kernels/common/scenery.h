@@ -3,8 +3,6 @@
 // N environments, D layouts, A agents per environment, M lines of the agent model, K texels of one
 // environment's agents. W walls, T texels and l lights of all layouts together.
 #pragma once
-#include "common/backend.h"
-#include "common/constants.h"
 #include "common/errors.h"
 
 struct SceneryParams {

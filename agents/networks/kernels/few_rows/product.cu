@@ -26,6 +26,7 @@ struct Side {
 // transposed. What does not exist is 0.
 template <bool is_transposed>
 DEVICE void begin_matrix(Bits* target, const Side& side, int first_inner, int end) {
+#pragma unroll
     for (int i = threadIdx.x; i < TILE * TILE / 8; i += TILE_THREADS) {
         int row = i / (TILE / 8), column = i % (TILE / 8) * 8;
         int outer = side.first + (is_transposed ? column : row);
@@ -96,8 +97,10 @@ DEVICE void multiply(const ProductParams& p) {
         begin(step + 1);
         wait_for_copies<1>();
         __syncthreads();
+#pragma unroll
         for (int k = 0; k < TILE; k += 16) {
             unsigned int rows[2][4], columns[4][2];
+#pragma unroll
             for (int i = 0; i < 2; i++) {
                 unsigned int near[2], far[2];
                 load_square<false, false>(near, far, matrix(step, 0), row + 16 * i, k);
@@ -106,10 +109,13 @@ DEVICE void multiply(const ProductParams& p) {
                 rows[i][2] = far[0];
                 rows[i][3] = far[1];
             }
+#pragma unroll
             for (int j = 0; j < 4; j += 2)
                 load_square<is_right_transposed, true>(columns[j], columns[j + 1], matrix(step, 1),
                                                        column + 8 * j, k);
+#pragma unroll
             for (int i = 0; i < 2; i++)
+#pragma unroll
                 for (int j = 0; j < 4; j++)
                     multiply_add(sums[i][j], rows[i], columns[j][0], columns[j][1]);
         }
@@ -119,6 +125,7 @@ DEVICE void multiply(const ProductParams& p) {
     column += right.first + 2 * q;
 #pragma unroll
     for (int i = 0; i < 2; i++)
+#pragma unroll
         for (int j = 0; j < 4; j++) {
             const float (&x)[4] = sums[i][j];
             write_results(p, row + 16 * i, column + 8 * j, x[0], x[1]);

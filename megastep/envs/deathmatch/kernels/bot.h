@@ -2,7 +2,6 @@
 // approaches. If it sees none, it walks about and turns away from walls.
 #pragma once
 #include "common/group.h"
-#include "common/math.h"
 #include "params.h"
 
 constexpr int NO_PIXEL = 0x7fffffff;

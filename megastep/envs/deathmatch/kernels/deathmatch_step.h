@@ -2,7 +2,6 @@
 // rewards, and where episodes start and end. An agent on its first observation neither hits nor is
 // hit.
 #pragma once
-#include "common/math.h"
 #include "params.h"
 
 constexpr float MIN_HEALTH = 1e-4f;    // less is a rounding error and counts as 0

@@ -71,10 +71,7 @@ HD void start_episode(const HideAndSeekStepParams& p, int env, int layout) {
         object.y = at[1];
         object.angle = 360.f * unit_float(bits.a) - 180.f;
         object.visible = 1;
-        Body& body = bodies_in(p, env)[k];
-        body.vx = body.vy = body.turning = 0.f;
-        body.holder = body.owner = -1;
-        body.locked = 0;
+        rest(bodies_in(p, env)[k]);
         float* placed = p.placed + 2 * ((long long)env * n_bodies + k);
         placed[0] = at[0];
         placed[1] = at[1];
@@ -151,10 +148,9 @@ HD void use_hand(const HideAndSeekStepParams& p, const Walls& walls, int env, in
         body.holder = a;
         body.grabbed = 1;
     } else if (locks && !body.locked) {
+        rest(body);
         body.locked = 1;
         body.owner = team;
-        body.holder = -1;
-        body.vx = body.vy = body.turning = 0.f;
     } else if (locks && body.owner == team) {
         body.locked = 0;
         body.owner = -1;

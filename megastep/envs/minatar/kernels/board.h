@@ -1,6 +1,5 @@
 // What MinAtar's games share: their parameters, random numbers, and boards of 10 x 10 cells.
 #pragma once
-#include "common/errors.h"
 #include "common/philox.h"
 #include "common/step.h"
 

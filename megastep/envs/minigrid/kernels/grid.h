@@ -1,6 +1,5 @@
 // The state of MiniGrid's games, and how random numbers are drawn.
 #pragma once
-#include "common/errors.h"
 #include "common/philox.h"
 #include "common/step.h"
 

@@ -1,7 +1,6 @@
 // MiniGrid (Chevalier-Boisvert et al. 2023): the steps and the observations of all its tasks. Cells
 // are bytes, and random numbers are drawn in the order of minigrid 3.2.
 #pragma once
-#include "grid.h"
 #include "layouts.h"
 
 HD void turn(Game& g, int by) { g.direction = (g.direction + by) & 3; }
