@@ -26,9 +26,7 @@ from megastep.web.page import SHIPPED
 LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MINATAR, MINIGRID, MEMORY, KEYS
 LIBRARIES += HIDEANDSEEK, POLICY
 #: Operations of setting up, of scripted bots and of robots, which no page launches.
-ABSENT = {
-    *("bake", "place_objects", "uniform", "bot", "scan"),
-}
+ABSENT = {"bake", "place_objects", "uniform", "bot", "scan"}
 
 
 def operations():

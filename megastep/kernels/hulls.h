@@ -47,10 +47,15 @@ HD Touch swapped(const Touch& t) {
             t.n};
 }
 
+// One point at a gap, with an arm of the first hull; the normal goes through the second's centre.
+HD Touch touch_at(float nx, float ny, float gap, float arm) {
+    return {nx, ny, {gap, 0.f}, {arm, 0.f}, {0.f, 0.f}, 1};
+}
+
 HD Touch touch_discs(const Hull& a, const Hull& b) {
     float dx = b.x - a.x, dy = b.y - a.y, apart = SQRT(dx * dx + dy * dy);
     float nx = apart > 0.f ? dx / apart : 1.f, ny = apart > 0.f ? dy / apart : 0.f;
-    return {nx, ny, {apart - a.hx - b.hx, 0.f}, {0.f, 0.f}, {0.f, 0.f}, 1};
+    return touch_at(nx, ny, apart - a.hx - b.hx, 0.f);
 }
 
 HD float signed_as(float x, float sign) { return sign < 0.f ? -x : x; }
@@ -71,12 +76,8 @@ HD Touch touch_disc(const Hull& box, const Hull& disc) {
         ny = is_x ? 0.f : signed_as(1.f, y);
         apart = is_x ? -in_x : -in_y;
     }
-    return {box.cosine * nx - box.sine * ny,
-            box.sine * nx + box.cosine * ny,
-            {apart - disc.hx, 0.f},
-            {on_x * ny - on_y * nx, 0.f},
-            {0.f, 0.f},
-            1};
+    return touch_at(box.cosine * nx - box.sine * ny, box.sine * nx + box.cosine * ny,
+                    apart - disc.hx, on_x * ny - on_y * nx);
 }
 
 // Two rectangles. Of the four directions of their sides, the one along which they are furthest

@@ -86,7 +86,7 @@ def nvrtc(files, flags=kernel_library.CUDA_FLAGS):
 
 
 def test_nvrtc_reports_file_and_line():
-    files = {**ENGINE.sources(".h"), "bad.cu": "#include \"spawn.h\"\nint broken"}
+    files = {**ENGINE.sources(".h"), "bad.cu": '#include "spawn.h"\nint broken'}
     with pytest.raises(compile.EngineError, match=r"bad\.cu\(2\): error"):
         nvrtc(files)
 

@@ -5,10 +5,6 @@
 #include "common/sums.h"
 #include "params.h"
 
-static_assert(sizeof(AdamParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
-static_assert(sizeof(SquaredNormParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
-static_assert(sizeof(JudgeParams::metrics) == JUDGED_METRICS * sizeof(MetricParams));
-
 // Where a thread's word is: in a row, from a number on, `n` of its four numbers exist.
 struct WordIndex {
     int row;

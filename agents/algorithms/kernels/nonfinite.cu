@@ -2,8 +2,6 @@
 #include "common/half.h"
 #include "params.h"
 
-static_assert(sizeof(CheckedParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
-
 DEVICE float value_at(const CheckedTensorParams& tensor, long long at) {
     if (!tensor.is_half)
         return ((const float*)tensor.values)[at];

@@ -116,7 +116,7 @@ struct AdamRowParams {
 };
 
 struct SquaredNormParams {
-    AdamRowParams rows[48];
+    AdamRowParams rows[ADAM_ROWS];
     float* sums;  // (n_sums), of this launch's blocks from first_sum on
     int n_rows;
     int first_sum;
@@ -127,7 +127,7 @@ struct MetricParams {
 };
 
 struct JudgeParams {
-    MetricParams metrics[32];
+    MetricParams metrics[JUDGED_METRICS];
     const float* sums;                // (n_sums), of squared gradients
     const unsigned char* is_finite;   // (), whether the transitions are
     const unsigned char* is_enabled;  // (); null: true
@@ -142,7 +142,7 @@ struct JudgeParams {
 };
 
 struct AdamParams {
-    AdamRowParams rows[48];
+    AdamRowParams rows[ADAM_ROWS];
     const float* lr;                // ()
     const float* n_steps;           // (), this one included
     const float* grad_norm;         // (); null: gradients are not clipped
@@ -165,7 +165,7 @@ struct CheckedTensorParams {
 
 // A row is a step of a tensor, in the order (T + 1, n_tensors).
 struct CheckedParams {
-    CheckedTensorParams tensors[16];
+    CheckedTensorParams tensors[CHECKED_TENSORS];
     int* first_rows;  // (B), the first row with a number above the limit; larger if there is none
     int n_tensors;
     int n_steps;  // T + 1

@@ -4,8 +4,6 @@
 #include "number.h"
 #include "params.h"
 
-static_assert(sizeof(CastParams::rows) == CAST_ROWS * sizeof(CastRowParams));
-
 KERNEL __launch_bounds__(256) cast(CastParams p) {
     wait_for_previous();
     const CastRowParams& its = p.rows[row_of_block(p.rows, p.n_rows)];

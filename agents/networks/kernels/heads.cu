@@ -150,7 +150,6 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
         clear(sums);
         for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
             float values[AT_ONCE][WORD], expected[AT_ONCE][WORD], d_errors[AT_ONCE];
-#pragma unroll
             for (int i = 0; i < AT_ONCE; i++) {
                 long long row = min(start + i * strip.step, strip.end - 1);
                 long long at = row * index.n_columns + column;
@@ -162,7 +161,6 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
                 d_errors[i] =
                     index.first_score ? p.d_errors[row] * 2.f / (float)p.n_predicted : 0.f;
             }
-#pragma unroll
             for (int i = 0; i < AT_ONCE; i++) {
                 int row = start + i * strip.step;
                 if (row >= strip.end)
@@ -196,14 +194,12 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     float scale = *p.value_scale;
     for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
         float hidden[AT_ONCE][WORD], d_values[AT_ONCE];
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
             long long row = min(start + i * strip.step, strip.end - 1);
             read<Bfloat16>(hidden[i], p.product,
                            row * index.n_columns + index.first_hidden + column);
             d_values[i] = p.d_values[row] * scale;
         }
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
             int row = start + i * strip.step;
             if (row >= strip.end)

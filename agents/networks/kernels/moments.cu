@@ -100,8 +100,6 @@ KERNEL __launch_bounds__(1024) add_moments(AddMomentsParams p) {
 
 // ---- The valid ones of many numbers; blocks along y: arrays ----
 
-static_assert(sizeof(MaskedPartsParams::arrays) == MASKED_ARRAYS * sizeof(MaskedArrayParams));
-
 // A block has MASKED_NUMBERS neighbouring numbers of an array per thread.
 KERNEL __launch_bounds__(256) masked_parts(MaskedPartsParams p) {
     wait_for_previous();

@@ -3,8 +3,6 @@
 #include "number.h"
 #include "params.h"
 
-static_assert(sizeof(NormaliseParams::leaves) == MAX_LEAVES * sizeof(IntakeLeafParams));
-
 DEVICE void unpack(float (&values)[4], uint2 word) {
     values[0] = half_value(word.x & 0xffff);
     values[1] = half_value(word.x >> 16);

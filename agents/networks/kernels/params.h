@@ -67,7 +67,7 @@ struct IntakeLeafParams {
 };
 
 struct NormaliseParams {
-    IntakeLeafParams leaves[8];
+    IntakeLeafParams leaves[MAX_LEAVES];
     const long long* lanes;  // (M), the lanes to read; null: all, M = B
     void* features;          // (T, M, n_columns) bfloat16
     int n_steps;
@@ -79,10 +79,10 @@ struct NormaliseParams {
 };
 
 struct MomentsParams {
-    IntakeLeafParams leaves[8];       // (B, n_features), without mean and scale
-    const unsigned char* is_counted;  // (B)
-    float* parts;                     // (n_statistics, n_parts, 3): lanes that count, mean, and
-                                      // squares of what is beside it, per number of a lane
+    IntakeLeafParams leaves[MAX_LEAVES];  // (B, n_features), without mean and scale
+    const unsigned char* is_counted;      // (B)
+    float* parts;                         // (n_statistics, n_parts, 3): lanes that count, mean, and
+                                          // squares of what is beside it, per number of a lane
     int n_lanes;
 };
 
@@ -98,7 +98,7 @@ struct RunningNormParams {
 };
 
 struct AddMomentsParams {
-    RunningNormParams norms[8];
+    RunningNormParams norms[MAX_LEAVES];
     const unsigned char* is_counted;  // (), false: nothing changes; null: true
 };
 
@@ -112,7 +112,7 @@ struct CastRowParams {
 };
 
 struct CastParams {
-    CastRowParams rows[48];
+    CastRowParams rows[CAST_ROWS];
     int n_rows;
 };
 
@@ -122,7 +122,7 @@ struct MaskedArrayParams {
 };
 
 struct MaskedPartsParams {
-    MaskedArrayParams arrays[4];
+    MaskedArrayParams arrays[MASKED_ARRAYS];
     const unsigned char* valid;  // (n), of all arrays
     float* parts;  // (n_arrays, n_blocks, 3): count, mean, sum of squared distances from it
     int n;

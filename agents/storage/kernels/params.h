@@ -18,7 +18,7 @@ struct CopyParams {
 };
 
 struct CopyAllParams {
-    CopyParams copies[24];
+    CopyParams copies[MAX_COPIES];
     const unsigned char* condition;  // (), false: nothing changes; null: true
     int n_copies;
 };
@@ -33,7 +33,7 @@ struct SelectParams {
 };
 
 struct SelectLanesParams {
-    SelectParams tensors[16];
+    SelectParams tensors[MAX_SELECTED];
     const long long* lanes;   // (M)
     unsigned int n_lanes;     // B
     unsigned int n_selected;  // M
@@ -48,7 +48,7 @@ struct TreeLevelParams {
 };
 
 struct SumTreeParams {
-    TreeLevelParams levels[8];
+    TreeLevelParams levels[MAX_LEVELS];
     int n_levels;
 };
 
@@ -92,7 +92,7 @@ struct ReadTensorParams {
 };
 
 struct ReadSequencesParams {
-    ReadTensorParams tensors[16];
+    ReadTensorParams tensors[MAX_SELECTED];
     const unsigned char* flags;    // (rows of the ring, B): starts, learns, terminal, truncated
     unsigned char* starts;         // (L + 1, M)
     unsigned char* learns;         // (L + 1, M)

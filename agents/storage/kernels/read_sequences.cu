@@ -5,8 +5,6 @@
 #include "common/sums.h"
 #include "params.h"
 
-static_assert(sizeof(ReadSequencesParams::tensors) == MAX_SELECTED * sizeof(ReadTensorParams));
-
 // Where a sequence starts.
 struct Start {
     unsigned int slot, lane;

@@ -2,11 +2,11 @@
 sources, so that structs, constants and operations are declared once:
 
 * structs whose names end in ``Params``, one field per line: ``const float* positions;``, or an
-  array of such structs: ``LeafParams leaves[4];``. A struct may begin with the fields of another:
-  ``struct PongParams : StepParams {``
+  array of such structs: ``LeafParams leaves[LEAVES];``. A struct may begin with the fields of
+  another: ``struct PongParams : StepParams {``
 * constants that are plain numbers, one per line: ``constexpr int MAX_RES = 1024;``
 * operations, each at the start of a line: ``KERNEL render(RenderParams p)``; for a GPU,
-  ``INSTANCE(physics, PhysicsParams, ...)``; in a header, for both, ``EACH(`` or ``EACH_WARP(spawn,``
+  ``INSTANCE(physics, PhysicsParams, ...)``; in a header, for both, ``EACH(`` or ``EACH_WARP(``
 """
 
 import ctypes
@@ -44,13 +44,12 @@ CONSTANT = re.compile(r"^constexpr (int|float) (\w+) = (-?[\d.]+(?:e-?\d+)?)f?;"
 STRUCT = re.compile(r"^struct (\w+Params)(?: : (\w+Params))? \{(.*?)^\};", re.M | re.S)
 FIELD = re.compile(r"(?:const )?([\w ]+?)\s*(\*?)\s*\b(\w+)(?:\[(\d+)\])?")
 OPERATION = re.compile(
-    r"^(?:KERNEL|(INSTANCE|EACH|EACH_WARP)\()\s*(?:\w+\([\w, ]+\) )?(\w+)(?:, |\((?:const )?)(\w+Params)\b"
-    r"(?:\s*&?\s*\w+\)\s*\{\s*(wait_for_previous\(\)\s*;)?)?",
+    r"^(?:KERNEL|(INSTANCE|EACH|EACH_WARP)\()\s*(?:\w+\([\w, ]+\) )?(\w+)(?:, |\((?:const )?)"
+    r"(\w+Params)\b(?:\s*&?\s*\w+\)\s*\{\s*(wait_for_previous\(\)\s*;)?)?",
     re.M,
 )
 COMMENT = re.compile(r"//.*|/\*[\s\S]*?\*/")
-TYPES: dict[str, Any] = {"int": ctypes.c_int, "float": ctypes.c_float}
-TYPES["unsigned int"] = ctypes.c_uint
+TYPES: Any = {"int": ctypes.c_int, "float": ctypes.c_float, "unsigned int": ctypes.c_uint}
 #: The source of a function that packs a struct.
 PACKED = """
 def packed(**values):
@@ -110,6 +109,7 @@ class KernelLibrary:
     def structs(self) -> dict[str, type[ctypes.Structure]]:
         found: dict[str, Any] = {}
         for header, text in self.sources(".h").items():
+            text = re.sub(r"\[(\w+)", lambda at: f"[{self.constants.get(at[1], at[1])}", text)
             for name, base, body in STRUCT.findall(COMMENT.sub("", text)):
                 parent: Any = found[base] if base else ctypes.Structure
                 own: list[tuple[str, Any]] = []

@@ -100,7 +100,6 @@ DEVICE void multiply(const ProductParams& p) {
 #pragma unroll
         for (int k = 0; k < TILE; k += 16) {
             unsigned int rows[2][4], columns[4][2];
-#pragma unroll
             for (int i = 0; i < 2; i++) {
                 unsigned int near[2], far[2];
                 load_square<false, false>(near, far, matrix(step, 0), row + 16 * i, k);
@@ -109,13 +108,10 @@ DEVICE void multiply(const ProductParams& p) {
                 rows[i][2] = far[0];
                 rows[i][3] = far[1];
             }
-#pragma unroll
             for (int j = 0; j < 4; j += 2)
                 load_square<is_right_transposed, true>(columns[j], columns[j + 1], matrix(step, 1),
                                                        column + 8 * j, k);
-#pragma unroll
             for (int i = 0; i < 2; i++)
-#pragma unroll
                 for (int j = 0; j < 4; j++)
                     multiply_add(sums[i][j], rows[i], columns[j][0], columns[j][1]);
         }
@@ -125,7 +121,6 @@ DEVICE void multiply(const ProductParams& p) {
     column += right.first + 2 * q;
 #pragma unroll
     for (int i = 0; i < 2; i++)
-#pragma unroll
         for (int j = 0; j < 4; j++) {
             const float (&x)[4] = sums[i][j];
             write_results(p, row + 16 * i, column + 8 * j, x[0], x[1]);

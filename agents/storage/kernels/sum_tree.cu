@@ -1,5 +1,4 @@
 // The sum tree on a GPU: a block of 32 children is what a warp reads at once.
-#pragma once
 #include "common/sums.h"
 #include "params.h"
 
@@ -48,4 +47,52 @@ DEVICE void set_values(const SumTreeParams& tree, const long long* index, const 
         }
         __syncthreads();
     }
+}
+
+// Draws indices in proportion to their priorities, one warp per index, from the highest level down.
+KERNEL sample_tree(SampleTreeParams p) {
+    wait_for_previous();
+    int sample = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, lane = threadIdx.x % WARP;
+    if (sample >= p.n_samples)
+        return;
+    long long index = 0;
+    double rest = 0., total = 0.;
+    for (int level = p.tree.n_levels - 1; level >= 0; level--) {
+        double sum = p.tree.levels[level].sums[index * WARP + lane];
+        if (level == p.tree.n_levels - 1) {
+            total = sum_of_threads(sum);
+            rest = (p.fractions[sample] + sample) / p.n_samples * total;
+        }
+        int child = find_child(sum, rest);
+        if (!level && lane == child) {
+            p.index[sample] = index * WARP + child;
+            p.probability[sample] = sum / fmax(total, 2.2250738585072014e-308);
+        }
+        index = index * WARP + child;
+    }
+}
+
+// Changes priorities and the sums above them, in one block: there are a few thousand, and each
+// level waits for the one below.
+KERNEL set_tree(SetTreeParams p) {
+    wait_for_previous();
+    set_values(p.tree, p.index, p.values, p.n);
+}
+
+// `ReplayBuffer.set_priorities`
+KERNEL set_priorities(SetPrioritiesParams p) {
+    wait_for_previous();
+    bool is_ready = *p.n_available > 0 && *p.n_added >= p.first_rollouts;
+    double largest = 0.;
+    for (int i = threadIdx.x; i < p.n; i += blockDim.x) {
+        double old = p.tree.levels[0].sums[p.index[i]], value = (double)p.errors[i];
+        value = pow(value < (double)p.smallest ? (double)p.smallest : value, (double)p.alpha);
+        bool is_set = is_ready && old > 0. && isfinite(value);  // NaN stays, and is not
+        p.values[i] = is_set ? value : old;
+        largest = is_set ? fmax(largest, value) : largest;
+    }
+    largest = largest_of_block<SET_THREADS>(largest);
+    if (!threadIdx.x && largest > 0.)
+        *p.new_priority = largest;
+    set_values(p.tree, p.index, p.values, p.n);
 }
