@@ -14,7 +14,6 @@ constexpr int N = 16 / sizeof(Bfloat16);    // numbers that a thread reads at on
 // Sums over the warp: thread i returns that of sums[i].
 DEVICE float sum_of_own(float (&sums)[WARP]) {
     int lane = threadIdx.x % WARP;
-#pragma unroll
     for (int half = WARP / 2; half; half /= 2)
 #pragma unroll
         for (int i = 0; i < half; i++) {
@@ -33,7 +32,6 @@ DEVICE float products(const DuellingForwardParams& p, const long long (&rows)[RO
     float sums[WARP] = {};
     for (int first = N * (threadIdx.x % WARP); first < p.width; first += N * WARP) {
         float hidden[ROWS][N];
-#pragma unroll
         for (int i = 0; i < ROWS; i++)
             read<Bfloat16>(hidden[i], p.hidden, rows[i] * (2 * p.width) + offset + first);
 #pragma unroll
@@ -41,9 +39,7 @@ DEVICE float products(const DuellingForwardParams& p, const long long (&rows)[RO
             if (k < n_outputs) {
                 float weights[N];
                 read_eight(weights, weight + k * p.width + first);
-#pragma unroll
                 for (int i = 0; i < ROWS; i++)
-#pragma unroll
                     for (int n = 0; n < N; n++)
                         sums[OUTPUTS * i + k] += hidden[i][n] * weights[n];
             }
@@ -62,7 +58,6 @@ DEVICE Part find_part(const DuellingForwardParams& p) {
     int lane = threadIdx.x % WARP, n_outputs = p.n_agents * p.n_choices;
     int first = (blockIdx.x * blockDim.x + threadIdx.x) / WARP * ROWS;
     Part part;
-#pragma unroll
     for (int i = 0; i < ROWS; i++)
         part.rows[i] = min(first + i, p.n_rows - 1);
     part.row = first + lane / OUTPUTS;
@@ -80,7 +75,6 @@ DEVICE float value_of(const DuellingForwardParams& p, const Part& me) {
     advantage += p.advantage_bias[min(me.part, last)];
     value = __shfl_sync(~0u, value, me.agent, OUTPUTS) + p.value_bias[me.agent];
     float sum = 0.f;
-#pragma unroll
     for (int k = 0; k < OUTPUTS; k++) {
         float other = __shfl_sync(~0u, advantage, k, OUTPUTS);
         sum += k / p.n_choices == me.agent && k < n_outputs ? other : 0.f;
@@ -101,7 +95,6 @@ KERNEL __launch_bounds__(64) duelling_act(DuellingForwardParams p) {
     Part me = find_part(p);
     float value = value_of(p, me), best_value = 0.f, logprob = 0.f;
     int best = -1, n_outputs = p.n_agents * p.n_choices, agent = me.agent;
-#pragma unroll
     for (int k = 0; k < OUTPUTS; k++) {  // the first of the best choices of this thread's agent
         float other = __shfl_sync(~0u, value, k, OUTPUTS);
         if (k / p.n_choices == agent && k < n_outputs && (best < 0 || other > best_value)) {
@@ -122,7 +115,6 @@ KERNEL __launch_bounds__(64) duelling_act(DuellingForwardParams p) {
     float chance = p.usual_epsilon / (float)p.n_choices;
     chance += action == best ? 1.f - p.usual_epsilon : 0.f;
     float own = is_first ? logf(chance) : 0.f;
-#pragma unroll
     for (int k = 0; k < OUTPUTS; k++)
         logprob += __shfl_sync(~0u, own, k, OUTPUTS);
     if (me.exists && !me.part)
@@ -145,7 +137,6 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
     constexpr int AT_ONCE = 8;  // rows whose loads do not wait
     float weights[K][2], d_weights[K][2], sums[2] = {};
     int in_half = column % p.width;
-#pragma unroll
     for (int k = 0; k < K; k++) {
         clear(d_weights[k]);
         clear(weights[k]);
@@ -156,25 +147,20 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
     int n_rows = min(STRIP_ROWS, p.n_rows - (int)blockIdx.x * STRIP_ROWS);
     for (int start = 0; start < n_rows; start += AT_ONCE) {
         float hidden[AT_ONCE][2];
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++)
             read<Bfloat16>(hidden[i], p.hidden,
                            (first + min(start + i, n_rows - 1)) * (2 * p.width) + column);
-#pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
             if (start + i >= n_rows)
                 break;
             const RowGradient& row = gradients[start + i];
             const float* d = is_value ? row.value : row.advantage;
             float d_hidden[2] = {};
-#pragma unroll
             for (int k = 0; k < K; k++)
-#pragma unroll
                 for (int n = 0; n < 2; n++) {
                     d_hidden[n] += d[k] * weights[k][n];
                     d_weights[k][n] += d[k] * hidden[i][n];
                 }
-#pragma unroll
             for (int n = 0; n < 2; n++) {
                 d_hidden[n] = hidden[i][n] <= 0.f ? 0.f : d_hidden[n];
                 sums[n] += d_hidden[n];
@@ -182,10 +168,8 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
             write<Bfloat16>(p.d_hidden, (first + start + i) * (2 * p.width) + column, d_hidden);
         }
     }
-#pragma unroll
     for (int n = 0; n < 2; n++) {
         d_bias[column + n] = sums[n];
-#pragma unroll
         for (int k = 0; k < K; k++)
             if (k < n_outputs)
                 d_weight[(long long)k * p.width + in_half + n] = d_weights[k][n];
@@ -204,17 +188,14 @@ KERNEL __launch_bounds__(256) duelling_backward(DuellingBackwardParams p) {
     for (int i = threadIdx.x; i < STRIP_ROWS; i += DUELLING_THREADS) {
         RowGradient gradient = {};
         if (i < n_rows)
-#pragma unroll
             for (int k = 0; k < OUTPUTS; k++) {
                 if (k >= n_outputs)
                     break;
                 float d = p.d_values[(first + i) * n_outputs + k];
                 gradient.advantage[k] = d;
-#pragma unroll
                 for (int agent = 0; agent < OUTPUTS; agent++)
                     gradient.value[agent] += k / p.n_choices == agent ? d : 0.f;
             }
-#pragma unroll
         for (int k = 0; k < OUTPUTS; k++)
 #pragma unroll
             for (int agent = 0; agent < OUTPUTS; agent++)
