@@ -4,6 +4,7 @@ import functools
 from collections.abc import Iterable
 
 import torch
+from torch.autograd.graph import _engine_run_backward as run_backward
 
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
@@ -130,7 +131,9 @@ class GradientSteps:
         parameters = self.optimizer.parameters
         for parameter in parameters:
             parameter.grad = None
-        loss.backward(one(loss.device))
+        # as `loss.backward(one)` does it, which imports SymPy for half a second, to compare shapes
+        options = dict(allow_unreachable=True, accumulate_grad=True)
+        run_backward((loss,), (one(loss.device),), False, False, (), **options)
         n_valid, means = average_gradients(parameters, n_valid, [*metrics.values()])
         self.n_valid, self.metrics = n_valid.long(), dict(zip(metrics, means, strict=True))
         return self.metrics
