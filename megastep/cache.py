@@ -81,9 +81,9 @@ def arrays(
 
 def warn(problem: str) -> None:
     warnings.warn(
-        f"the cache is not used, so kernels, light, spawn points, shortest paths, visible texels "
-        f"and the episodes of Keys are computed at each start: {problem}; set MEGASTEP_CACHE to a "
-        "folder of your own",
+        f"the cache is not used, so kernels, mazes, light, spawn points, shortest paths, visible "
+        f"texels and the episodes of Keys are computed at each start: {problem}; set "
+        "MEGASTEP_CACHE to a folder of your own",
         stacklevel=2,
     )
 

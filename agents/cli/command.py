@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import dataclasses
+import gc
 import importlib
 import sys
 import warnings
@@ -65,6 +66,7 @@ class Command:
             return 0 if options.help else 2
         from megastep.agents.cli import words
 
+        gc.enable()
         result = self.call(words.plain_tree(self.kind, options.overrides))
         return result if isinstance(result, int) else 0
 

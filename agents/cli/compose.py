@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import gc
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -210,7 +211,11 @@ class Composer:
                 errors.append((key_of(one), text))
             else:
                 typed.append(typed_word(one))
-        return self.checked(typed, errors)
+        checked = self.checked(typed, errors)
+        if not gc.isenabled():  # stopped by `entry`
+            gc.freeze()
+            gc.enable()
+        return checked
 
     def checked(self, typed: list[Typed], errors: list) -> tuple[Any, DictConfig]:
         """Returns what `compose` does. `errors` has what is wrong already."""

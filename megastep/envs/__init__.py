@@ -10,7 +10,7 @@ _SHARED = ("common", "first_person")  # modules that hold no environment
 
 
 class _Envs(Mapping[str, type]):
-    """A module's environment is the first name in its ``__all__``, its own name but for capitals."""
+    """A module's environment is the first of its ``__all__``, its own name but for capitals."""
 
     names = [file.name for file in pkgutil.iter_modules(__path__) if file.name not in _SHARED]
 

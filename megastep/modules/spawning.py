@@ -186,10 +186,24 @@ def cached_points(
         points = [spawn_points(g, n, n_agents, radius, r) for g, r in zip(geometries, generators)]
         return dict(points=np.stack(points).astype(np.float32))
 
+    arguments = n, n_agents, radius, seed
+    return cached(PREFIX, Path(__file__), geometries, arguments, build, MAX_FILES)["points"]
+
+
+def cached(
+    prefix: str,
+    source: Path,
+    geometries: Sequence[dotdict],
+    arguments: object,
+    build: Callable[[], dict[str, np.ndarray]],
+    max_files: int = 16,
+) -> dict[str, np.ndarray]:
+    """Returns what ``build``, a function in the file ``source``, makes of geometries and arguments.
+    Keeps that of many geometries in the cache, in files of a ``prefix``.
+    """
     if len(geometries) < MIN_CACHED:
-        return build()["points"]
-    parts = Path(__file__), n, n_agents, radius, seed, *contents(geometries)
-    return cache.arrays(PREFIX, parts, build, MAX_FILES)["points"]
+        return build()
+    return cache.arrays(prefix, (source, arguments, *contents(geometries)), build, max_files)
 
 
 class FreePoints:

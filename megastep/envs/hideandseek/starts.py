@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from megastep import cache, geometry
+from megastep import geometry
 from megastep.dotdict import dotdict
-from megastep.modules.spawning import CLEARANCE, candidates, distances, per_geometry
+from megastep.modules.spawning import CLEARANCE, cached, candidates, distances, per_geometry
 
 N_POINTS = 512  # drawn per layout
 ROUNDS = 50  # of drawing a start; then the search ends
-PREFIX, MAX_FILES = "hideandseek-", 16  # of the files in the cache, 3 MB each for 500 layouts
-MIN_CACHED = 32  # layouts
+PREFIX = "hideandseek-"  # of the files in the cache, 3 MB each for 500 layouts
 ANYWHERE, OUTER, INNER = range(3)  # where something may be put
 
 
@@ -24,11 +23,8 @@ def cached_starts(
 ) -> np.ndarray:
     """Returns :func:`starts`. Keeps those of many layouts in the cache."""
     arguments = n, tuple(radii), tuple(rooms), seed
-    if len(geometries) < MIN_CACHED:
-        return starts(geometries, *arguments)
-    parts = Path(__file__), arguments, *geometry.contents(geometries)
     build = lambda: dict(starts=starts(geometries, *arguments))  # noqa: E731
-    return cache.arrays(PREFIX, parts, build, MAX_FILES)["starts"]
+    return cached(PREFIX, Path(__file__), geometries, arguments, build)["starts"]
 
 
 def starts(

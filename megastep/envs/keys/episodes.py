@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from megastep import cache, geometry
+from megastep import geometry
 from megastep.dotdict import dotdict
-from megastep.modules.spawning import CLEARANCE, candidates, distances, per_geometry
+from megastep.modules.spawning import CLEARANCE, cached, candidates, distances, per_geometry
 
 RES = 0.1  # metres per cell, of the areas
 N_POINTS = 512  # drawn per layout
@@ -24,8 +24,7 @@ SIDES = 0.15, 0.25, 0.35  # metres from a doorway, at which the areas beside it 
 OPEN = -1  # the state of a doorway without a door; else a door's colour, or C if it stays locked
 APART = 0.5  # metres between the points of an episode, and between them and doorways
 ROUNDS = 50  # of drawing an episode's points; then the search ends
-PREFIX, MAX_FILES = "keys-", 16  # of the files in the cache, a megabyte each for 500 layouts
-MIN_CACHED = 32  # layouts; the search takes 20 ms for one
+PREFIX = "keys-"  # of the files in the cache, a megabyte each for 500 layouts
 
 
 class Episodes(NamedTuple):
@@ -69,11 +68,8 @@ class Areas:
 def cached_episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:
     """Returns :func:`episodes`. Keeps those of many layouts in the cache."""
     arguments = n, n_colours, seed
-    if len(geometries) < MIN_CACHED:
-        return episodes(geometries, *arguments)
-    parts = Path(__file__), arguments, *geometry.contents(geometries)
     build = lambda: episodes(geometries, *arguments)._asdict()  # noqa: E731
-    return Episodes(**cache.arrays(PREFIX, parts, build, MAX_FILES))
+    return Episodes(**cached(PREFIX, Path(__file__), geometries, arguments, build))
 
 
 def episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:

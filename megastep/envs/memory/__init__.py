@@ -17,7 +17,7 @@ from megastep.envs.first_person import FirstPerson, images
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.modules.kinds import REACH
 from megastep.modules.lifecycle import derived_seed
-from megastep.modules.spawning import CLEARANCE, candidates, distances, per_geometry
+from megastep.modules.spawning import CLEARANCE, cached, candidates, distances, per_geometry
 from megastep.settings import checked
 
 if TYPE_CHECKING:
@@ -42,10 +42,13 @@ def arrangements(
     ``radius`` around the points are 5 cm clear of walls, and any two points ``apart`` metres apart.
     ValueError naming a geometry where the objects do not fit.
     """
-    found = per_geometry(
-        geometries, seed, lambda g, random: _arrangements(g, n, n_objects, radius, apart, random)
-    )
-    return np.stack(found).astype(np.float32)
+    arguments = n, n_objects, radius, apart
+
+    def build() -> dict[str, np.ndarray]:
+        draw = lambda g, random: _arrangements(g, *arguments, random)  # noqa: E731
+        return dict(points=np.stack(per_geometry(geometries, seed, draw)).astype(np.float32))
+
+    return cached("objects-", Path(__file__), geometries, (*arguments, seed), build)["points"]
 
 
 def _arrangements(g, n, n_objects, radius, apart, random) -> np.ndarray:
