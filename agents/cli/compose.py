@@ -178,13 +178,14 @@ class Composer:
         hydra.initialize_config_dir(MAIN, job_name=command.name, version_base="1.3")
         self.loader = global_hydra.GlobalHydra.instance().config_loader()
         self.members = functools.cache(self.loader.get_group_options)
+        self.top = functools.cache(lambda: self.loader.list_groups(""))
         self.composed = functools.cache(self._composed)
 
     def groups(self) -> dict[str, list[str]]:
         """Returns {group: members} of the groups to choose from."""
         choices = self.composed(device="cpu").hydra.runtime.choices
         names = {group for group in choices if "/" not in group}
-        names |= {*self.loader.list_groups("")} if self.folder else set()
+        names |= {*self.top()} if self.folder else set()
         # import paths that were given in this process are members too
         files = {name: [m for m in self.members(name) if ":" not in m] for name in sorted(names)}
         return {name: members for name, members in files.items() if members and name != "hydra"}
@@ -198,6 +199,9 @@ class Composer:
 
         overrides = parse(words, self.command.kind, self.cure_for_value, self.loader)
         return [one for one in overrides if not is_left_out_anyway(one)]
+
+    def _group_names(self) -> list[str]:
+        return [*self.top(), *(f"hydra/{name}" for name in self.loader.list_groups("hydra"))]
 
     def settings(self, words: Iterable[str]) -> Any:
         return self.compose(words)[0]
@@ -229,8 +233,7 @@ class Composer:
                 from megastep.geometries import databases
 
                 databases.prefetch()  # while PyTorch is imported
-            groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
-            chosen = check.check(self.command.kind, tree, groups + self.loader.list_groups(""))
+            chosen = check.check(self.command.kind, tree, self._group_names)
             errors += conflicts.ignored_geometry(chosen.env, keys)
         except OmegaConfBaseException as error:
             errors.append((error.full_key or "configuration", str(error).partition("\n")[0]))
@@ -266,7 +269,7 @@ class Composer:
         groups, keys, errors = [], {}, []
         for one in typed:
             group = one.key.partition("@")[0]
-            options = self.members(group)
+            options = self.members(group) if "/" in group or group in self.top() else []
             chosen = one.value if group == "logger" and isinstance(one.value, list) else [one.value]
             others = [member for member in chosen if member not in options]
             labels = [components.label(name) for name in {*map(str, chosen)}]

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import NoneType
 from typing import Any, TypeVar, cast, get_args
 
@@ -18,8 +18,10 @@ Tree = dict[str, Any]
 T = TypeVar("T")
 
 
-def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
-    """Returns checked settings from nested dicts. ConfigErrors names all errors at once."""
+def check(kind: type[T], tree: Tree, names: Callable[[], Iterable[str]] = tuple) -> T:
+    """Returns checked settings from nested dicts. ConfigErrors names all errors at once, with the
+    nearest key of what `names` returns, too.
+    """
     try:
         chosen = components.adapter(kind).validate_python(tree)
     except ValidationError as error:
@@ -27,7 +29,7 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
         for line in error.errors():
             path = [str(part) for part in line["loc"]]
             if line["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-                text = _unknown(path, [*fields, *names])
+                text = _unknown(path, [*fields, *names()])
             else:
                 # inside a list, or an option of a union
                 while len(path) > 1 and ".".join(path) not in fields:
