@@ -12,7 +12,7 @@ from megastep import geodesics, geometries, geometry
 from megastep.dotdict import dotdict
 from megastep.engine import AGENT_RADIUS
 from megastep.geodesics import PathGraph
-from megastep.geometries import checks, databases, homes
+from megastep.geometries import checks, databases, homes, mazes, memory_mazes
 from megastep.geometries.homes import plan, portable_generator, regions
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from scripts import check_homes, make_homes
@@ -148,23 +148,33 @@ def test_no_room_has_cells_inside_furniture(dense):
         assert (labels[fine > 0] > 0).mean() > 0.99, "a cell that no wall touches is free"
 
 
-def test_dense_homes_of_the_source_are_generated_ones(monkeypatch, tmp_path):
-    """In two processes, in one, and from the cache."""
+@pytest.mark.parametrize(
+    "source, generate, options",
+    [
+        ("homes", homes.generate, dict(density=1.5, clutter=0.5)),
+        ("maze", mazes.generate, dict(size=4, braid=0.5)),
+        ("memory_maze", memory_mazes.generate, dict(size=11)),
+    ],
+)
+def test_what_a_source_generates_is_the_same_from_the_cache(
+    source, generate, options, monkeypatch, tmp_path
+):
+    """As in two processes and in one."""
     monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(databases, "SEEDS_EACH", 2)
     drawn = []
     for each in 2, 100:
         monkeypatch.setattr(databases, "SEEDS_EACH", each)
-        for _ in range(2):
-            databases.generated.cache_clear()
-            drawn.append(geometries.sample("homes", 5, "test", density=1.5, clutter=0.5))
+        drawn.append(geometries.sample(source, 5, "test", **options))
+        with monkeypatch.context() as patch:
+            patch.delattr(databases, "joined")  # which only what is not in the cache needs
+            drawn.append(geometries.sample(source, 5, "test", **options))
         shutil.rmtree(tmp_path / "cache")
-    databases.generated.cache_clear()
     for plans in drawn:
         assert [g.id for g in plans] == [g.id for g in geometries.sample("homes", 5, "test")]
         for g in plans:
-            expected = homes.generate(g.id, density=1.5, clutter=0.5)
+            expected = generate(g.id, **options)
             assert all(np.array_equal(g[key], expected[key]) for key in g)
+            assert set(databases.PARTS[:3]) < set(g)
 
 
 # ---- Cluttered homes ----
