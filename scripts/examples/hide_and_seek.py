@@ -33,6 +33,7 @@ from megastep.types import optional
 
 CELL = 0.015  # metres
 SLOP = 0.005  # metres by which agents and bodies may overlap
+LATER = 30  # steps after the preparation, about as many as seekers need to arrive
 AROUND = ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 UNTRAINED = "untrained"
 COLUMNS = {
@@ -41,6 +42,7 @@ COLUMNS = {
     "box_move": "box moved, m",
     "box_lock": "boxes locked",
     "closed": "closed in",
+    "later": "30 steps later",
     "locked_in": "by locked bodies",
     "enters": "closed: entered over a ramp",
     "ramp_lock": "closed: ramp locked",
@@ -109,16 +111,19 @@ def are_closed_in(floor: Floor, hiders: np.ndarray, seekers: np.ndarray) -> bool
 
 
 class Shelters:
-    """Where hiders are closed in at the end of the preparation, and who enters there.
+    """Where hiders are closed in, and who enters there.
 
-    Attributes, of each environment: (N,) bool whether all hiders are `closed` in, likewise if only
-    locked bodies stop seekers (`locked_in`), a ramp is locked by hiders (`ramp_lock`), and a seeker
-    entered over a ramp later (`enters`).
+    Attributes, of each environment: (N,) bool whether all hiders are closed in at the end of the
+    preparation (`closed`) and `LATER` steps after it (`later`); of those that are at either time,
+    likewise if only locked bodies stop seekers (`locked_in`), a ramp is locked by hiders
+    (`ramp_lock`), and a seeker entered over a ramp afterwards (`enters`).
     """
 
     def __init__(self, env: Any):
         self.env, n = env, env.n_envs
-        self.closed, self.locked_in, self.ramp_lock, self.enters = np.zeros((4, n), bool)
+        self.closed, self.later, self.locked_in, self.ramp_lock, self.enters = np.zeros(
+            (5, n), bool
+        )
         self.floors: list[Floor | None] = [None] * n
         self.shelters: list[np.ndarray] = [np.zeros(0)] * n
         lines, objects = env.core.scenery.layouts.lines, env.objects.all
@@ -134,24 +139,28 @@ class Shelters:
         positions, is_hider = self.env.core.agents.positions.cpu().numpy(), self.env.is_hider
         return positions[:, is_hider.cpu().numpy()], positions[:, ~is_hider.cpu().numpy()]
 
-    def begin(self, ends: np.ndarray) -> None:
-        """Looks at the environments (N,) bool whose preparation has ended."""
+    def look(self, at: np.ndarray, closed: np.ndarray) -> None:
+        """Writes into `closed` (N,) which of the environments `at` (N,) bool are closed now."""
         o, (hiders, seekers) = self.env.objects.all, self._agents()
         sizes = o.sizes[..., None] * torch.stack([torch.ones_like(o.widths), o.widths], -1)
         records = torch.cat([o.positions, o.angles[..., None], sizes], -1).cpu().numpy()
         slots, is_there = o.body_objects.cpu().numpy(), (o.visible & ~o.open).cpu().numpy()
         locked = ((o.owners == 0) & o.locked).cpu().numpy()
         layout = self.env.layout.cpu().numpy()
-        for e in np.flatnonzero(ends):
+        for e in np.flatnonzero(at):
             walls, bodies, is_body = self.walls[layout[e]], records[e][slots], is_there[e][slots]
             floor = floor_of(walls, bodies[is_body], self.env.core.agents.radius)
-            self.closed[e] = are_closed_in(floor, hiders[e], seekers[e])
-            if not self.closed[e]:
+            closed[e] = are_closed_in(floor, hiders[e], seekers[e])
+            if not closed[e]:
                 continue
-            self.ramp_lock[e] = (locked[e] & self.is_ramp).any()
+            self.ramp_lock[e] |= (locked[e] & self.is_ramp).any()
             self.floors[e], self.shelters[e] = floor, floor.at(hiders[e])
             of_locked = floor_of(walls, bodies[is_body & locked[e]], self.env.core.agents.radius)
-            self.locked_in[e] = are_closed_in(of_locked, hiders[e], seekers[e])
+            self.locked_in[e] |= are_closed_in(of_locked, hiders[e], seekers[e])
+
+    @property
+    def either(self) -> np.ndarray:
+        return self.closed | self.later
 
     def watch(self) -> None:
         """Looks for seekers that are elevated inside of a shelter."""
@@ -160,7 +169,7 @@ class Shelters:
             return
         is_up = (elevated > 0)[:, ~self.env.is_hider].cpu().numpy()
         _, seekers = self._agents()
-        for e in np.flatnonzero(self.closed & ~self.enters & is_up.any(1)):
+        for e in np.flatnonzero(self.either & ~self.enters & is_up.any(1)):
             inside = np.isin(self.floors[e].at(seekers[e][is_up[e]]), self.shelters[e])  # pyright: ignore
             self.enters[e] = inside.any()
 
@@ -173,7 +182,7 @@ def measure(env: Any, hiders: Any, seekers: Any, seed: int = 1) -> dict[str, np.
     policy = playing.duel_policy(hiders, seekers, env.is_hider.expand(env.n_envs, -1))
     world, draws = env.reset(), SeededGenerator(seed)
     state, shelters = policy.initial(env.n_envs * env.n_agents, env.device), Shelters(env)
-    shelters.begin((~env.is_prep).cpu().numpy())
+    shelters.look((~env.is_prep).cpu().numpy(), shelters.closed)
     n_seen = torch.zeros(env.n_envs, device=env.device)
     n_played = torch.zeros_like(n_seen)
     metrics: Any = {}
@@ -181,9 +190,10 @@ def measure(env: Any, hiders: Any, seekers: Any, seed: int = 1) -> dict[str, np.
         was_prep = env.is_prep
         decision, state = policy(world, state, generator=draws.on(world["reset"].device))
         world = env.step(decision)
-        shelters.begin((was_prep & ~env.is_prep).cpu().numpy())
-        shelters.watch()
+        shelters.look((was_prep & ~env.is_prep).cpu().numpy(), shelters.closed)
         plays = ~env.is_prep
+        shelters.look((plays & (n_played == LATER)).cpu().numpy(), shelters.later)
+        shelters.watch()
         n_seen += plays & env.seen[:, env.is_hider].any(1)
         n_played += plays
         metrics = world["metrics"]
@@ -192,9 +202,9 @@ def measure(env: Any, hiders: Any, seekers: Any, seed: int = 1) -> dict[str, np.
     found: dict = dict(hidden=of_env["hidden"], seen=n_seen / n_played)
     found |= dict(box_move=of_env["max_box_move_prep"], box_lock=of_env["num_box_lock_prep"])
     found = {key: values.double().cpu().numpy() for key, values in found.items()}
-    found |= dict(closed=shelters.closed, locked_in=shelters.locked_in)
+    found |= dict(closed=shelters.closed, later=shelters.later, locked_in=shelters.locked_in)
     for name in ("enters", "ramp_lock"):
-        found[name] = np.where(shelters.closed, getattr(shelters, name), np.nan)
+        found[name] = np.where(shelters.either, getattr(shelters, name), np.nan)
     return found | dict(homes=env.layout.cpu().numpy())
 
 

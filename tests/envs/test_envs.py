@@ -333,7 +333,7 @@ def test_check_raises_errors_flagged_on_the_device(name, device):
         (flag,) = [leaf for path, leaf in state_tree(env).items() if "error_flag" in path]
         flag.fill_(3 * ENGINE.constants["ERROR_KINDS"] + 1)
     else:
-        env.step(idle(env).map(torch.add, math.nan if is_continuous(env) else 7))
+        env.step(idle(env).map(torch.add, math.nan if is_continuous(env) else 99))
     with pytest.raises(EngineError, match="nvironment"):
         env.check()
     env.check()

@@ -77,11 +77,11 @@ def test_shelters_of_an_environment():
     objects["box"].angles[0, 0] = 0.0
     objects["ramp"].positions[0, 0] = torch.tensor([2.5, 2.5])
     shelters, everywhere = Shelters(env), np.ones(2, bool)
-    shelters.begin(everywhere)
+    shelters.look(everywhere, shelters.closed)
     assert shelters.closed.tolist() == [True, False] and not shelters.locked_in.any()
     objects["box"].lock(torch.tensor([[True, False], [False, False]]), 0)
     objects["ramp"].lock(torch.tensor([[True], [False]]), 0)
-    shelters.begin(everywhere)
+    shelters.look(everywhere, shelters.closed)
     assert shelters.locked_in.tolist() == shelters.ramp_lock.tolist() == [True, False]
     shelters.watch()
     objects.all.elevated[:, 2] = 5
