@@ -189,7 +189,7 @@ def spawn(
     kernel = "spawn_hidden" if checks.flag("hidden", hidden) else "spawn"
     kernel += "" if scenery.objects is None else "_objects"
     launch(
-        *(ENGINE, kernel, device, scenery.n_envs * (WARP if hidden else 1)),
+        *(ENGINE, kernel, device, scenery.n_envs * (1 if kernel == "spawn" else WARP)),
         **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
         mask=checks.address("mask", mask, lanes, torch.bool, device),
         points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, device),

@@ -81,11 +81,12 @@ HD int clear_point(const SpawnParams& p, int env, int a, int layout, int first) 
 }
 
 // Has agent a drop what it carries, where it is, and let go of what it holds.
-HD void drop_all(const ObjectsParams& o, int env, int a) {
-    for (int i = env * o.n_objects; i < (env + 1) * o.n_objects; i++)
+template <class Group>
+HD void drop_all(const ObjectsParams& o, const Group& group, int env, int a) {
+    for (int i = env * o.n_objects + group.rank; i < (env + 1) * o.n_objects; i += Group::SIZE)
         if (objects_of(o)[i].carrier == a)
             objects_of(o)[i].carrier = -1;
-    for (int i = env * o.n_bodies; i < (env + 1) * o.n_bodies; i++)
+    for (int i = env * o.n_bodies + group.rank; i < (env + 1) * o.n_bodies; i += Group::SIZE)
         if (bodies_of(o)[i].holder == a)
             bodies_of(o)[i].holder = -1;
 }
@@ -120,12 +121,11 @@ HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
         if (hidden)
             point = hidden_point<with_objects>(p, group, env, a, layout, point);
         sync(group);  // all threads have read what is written now
+        if (with_objects)
+            drop_all(p.objects, group, env, a);
         if (group.rank == 0) {
-            if (with_objects) {
-                drop_all(p.objects, env, a);
-                if (p.objects.elevated)
-                    p.objects.elevated[i] = 0;
-            }
+            if (with_objects && p.objects.elevated)
+                p.objects.elevated[i] = 0;
             if (p.point_index)
                 p.point_index[i] = a * n_per_agent + point;
             place(p, i, p.points + 2 * ((long long)layout * p.n_points + a * n_per_agent + point),
@@ -138,11 +138,12 @@ HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
 }
 
 // Agents, few of which respawn: a GPU has a thread per environment. Where points are to be hidden
-// it has a warp, each thread of which tests one wall at a time.
+// it has a warp, each thread of which tests one wall at a time; so it has where there are objects,
+// of which each thread drops some.
 EACH(spawn, SpawnParams, p.scenery.n_envs, threads_for_agents(p.scenery, 1 << 14),
      spawn_env<0, 0>(p, SingleThread{0}, i))
-EACH(spawn_objects, SpawnParams, p.scenery.n_envs, threads_for_agents(p.scenery, 1 << 14),
-     spawn_env<0, 1>(p, SingleThread{0}, i))
+EACH_WARP(spawn_objects, SpawnParams, p.scenery.n_envs, threads_for_agents(p.scenery, 1 << 14),
+          spawn_env<0, 1>(p, group, i))
 EACH_WARP(spawn_hidden, SpawnParams, p.scenery.n_envs, p.scenery.n_threads,
           spawn_env<1, 0>(p, group, i))
 EACH_WARP(spawn_hidden_objects, SpawnParams, p.scenery.n_envs, p.scenery.n_threads,
