@@ -1,6 +1,7 @@
 """Lines, warnings, tables and progress. Output that cannot be written never ends the work."""
 
 import contextlib
+import csv
 import os
 import re
 import shutil
@@ -8,7 +9,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from io import StringIO
 from typing import Any, TextIO
 
@@ -133,6 +134,13 @@ def table(
     if n == len(head):
         return text
     return f"{text}\nToo wide for this terminal, but in the file: {', '.join(head[n:])}"
+
+
+def as_csv(head: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+    """Returns a table as CSV; what is None is empty."""
+    text = StringIO()
+    csv.writer(text, lineterminator="\n").writerows([head, *rows])
+    return text.getvalue()
 
 
 def terminal_width() -> int | None:

@@ -13,9 +13,8 @@ import yaml
 
 from megastep.agents import console, package
 from megastep.agents.cli.command import Command
-from megastep.agents.errors import UserError, user_errors
-from megastep.agents.runs import json_lines
-from megastep.atomic_files import write_atomically
+from megastep.agents.errors import UserError
+from megastep.agents.runs import folders, json_lines
 from megastep.settings import closest
 
 HELP = """Makes results of docs/lab again.
@@ -89,7 +88,6 @@ def reproduce(name: str, row: dict) -> int:
     """Trains and evaluates a row, and compares. Returns the exit code."""
     from megastep.agents.cli import evaluate, train
     from megastep.agents.launch import gpu
-    from megastep.agents.runs import folders
 
     if row["device"] == "cpu":
         os.environ["OMP_NUM_THREADS"] = str(CPU_THREADS)  # before PyTorch is imported
@@ -136,8 +134,7 @@ def compare(name: str, row: dict, folder: Path, found: list[Interval]) -> int:
         console.say(f"The run had {samples:,} samples; {busy}")
     console.say(f"{name} is {'' if agree else 'NOT '}reproduced: {folder}")
     report = dict(row=name, is_reproduced=agree, samples=samples, values=values)
-    with user_errors(f"{folder} cannot be written: "):
-        write_atomically(folder / "reproduction.json", json.dumps(report, indent=2).encode())
+    folders.write({folder / "reproduction.json": json.dumps(report, indent=2)})
     return 0 if agree else 1
 
 

@@ -1,10 +1,8 @@
 """Sweeps by Hydra: all jobs are checked first, have GPUs of their own, and end in one table."""
 
 import contextlib
-import csv
 import dataclasses
 import importlib
-import io
 import itertools
 import json
 import os
@@ -343,9 +341,9 @@ def write_table(folder: Path, rows: list[Row], is_printed: bool = False) -> None
     if is_printed:
         console.say(f"Sweep\n{console.table(head, cells, width=console.terminal_width())}")
     write_atomically(folder / "sweep.md", console.table(head, cells, is_markdown=True).encode())
-    text, names = io.StringIO(), [*head, "folder"]
-    csv.writer(text).writerows([names, *([row.get(name) for name in names] for row in rows)])
-    write_atomically(folder / "sweep.csv", text.getvalue().encode())
+    names = [*head, "folder"]
+    text = console.as_csv(names, ([row.get(name) for name in names] for row in rows))
+    write_atomically(folder / "sweep.csv", text.encode())
     if is_printed:
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
 

@@ -8,7 +8,6 @@ from pydantic import Field
 from megastep.agents import console
 from megastep.agents.cli.command import Command
 from megastep.agents.cli.report import page
-from megastep.agents.errors import user_errors
 from megastep.agents.runs import folders
 
 HELP = """Writes a page that plays a trained agent in a browser, from one file without a server.
@@ -33,12 +32,9 @@ def run(
     """Writes a page, and says where and how large it is. Returns its path."""
     path = page(file, folders.folder_of(folders.find(run)) / "page.html")
     from megastep.agents.export import web  # with PyTorch
-    from megastep.atomic_files import write_atomically
 
     text = web.make(run, against, homes if homes is None else [*homes], seed)
-    with user_errors(f"{path} cannot be written: "):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, text.encode())
+    folders.write({path: text})
     console.say(f"Wrote {path}, {len(text) / 1e6:.2f} MB: open it in a browser")
     return path
 

@@ -13,12 +13,11 @@ import numpy as np
 
 from megastep.agents import console
 from megastep.agents.distributed import process_group
-from megastep.agents.errors import UserError, user_errors
+from megastep.agents.errors import UserError
 from megastep.agents.evaluation import tables
 from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.factory import settings
 from megastep.agents.runs import checkpoint, folders
-from megastep.atomic_files import write_atomically
 
 #: Number of orders that ratings are averaged over.
 N_ORDERS = 10
@@ -71,9 +70,8 @@ def write(
     title = f"Ratings in {title}, seed {cfg.seed}"
     cells = [[format(row[name], form) for name, form in COLUMNS.items()] for row in table]
     console.say(f"{title}\n{console.table([*COLUMNS], cells)}")
-    with user_errors(f"{folder} cannot be written: "):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / "ratings.csv", tables.as_csv(table).encode())
+    rows = [[*row.values()] for row in table]
+    folders.write({folder / "ratings.csv": console.as_csv([*table[0]], rows)})
     return folder / "ratings.csv"
 
 

@@ -1,21 +1,16 @@
 """Tables of evaluations: where they were made, and the files that hold them."""
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from megastep.agents import console
-from megastep.agents.errors import user_errors
 from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.factory.check import as_tree
 from megastep.agents.factory.components import SUITE, env_name, label
 from megastep.agents.factory.settings import Evaluate, Geometry
-from megastep.agents.runs import checkpoint
-from megastep.agents.runs.folders import folder_of, for_file
+from megastep.agents.runs import checkpoint, folders
 from megastep.agents.runs.typed_json import encoded
-from megastep.atomic_files import write_atomically
 
 INTERVAL = "95 % interval"
 
@@ -52,7 +47,7 @@ def write_table(
     .md, as .csv of `episodes`, and as .json, whose path it returns.
     """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
-    path = folder_of(loaded.path) / "evaluations" / f"{for_file('-'.join(names))[:200]}.json"
+    file = folders.folder_of(loaded.path) / "evaluations" / folders.for_file("-".join(names))[:200]
     result = dict(title=title, checkpoint=str(loaded.path), step=loaded.step)
     result |= dict(evaluation=encoded(as_tree(cfg)), rows=rows)
     result |= {"differences": differences} if differences else {}
@@ -60,29 +55,14 @@ def write_table(
     shown = grid([*rows, *differences])
     files = {"md": f"{title}\n\n{console.table(*shown, is_markdown=True)}\n"}
     if episodes:
-        columns = {key: [row.get(key) for row in episodes] for key in keys_of(episodes)}
+        keys = dict.fromkeys(key for row in episodes for key in row)
+        columns = {key: [row.get(key) for row in episodes] for key in keys}
         text = f'{text[:-2]},\n  "episodes": {json.dumps(columns)}\n}}'  # on one line
-        files["csv"] = as_csv(episodes)
+        files["csv"] = console.as_csv([*keys], zip(*columns.values(), strict=True))
     console.say(f"{title}\n{console.table(*shown, width=console.terminal_width())}")
-    with user_errors(f"{path.parent} cannot be written: "):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for ending, content in {**files, "json": text}.items():
-            write_atomically(path.with_name(f"{path.stem}.{ending}"), content.encode())
-    return path
-
-
-def keys_of(rows: Sequence[Mapping]) -> list[str]:
-    """Returns the keys of any of the rows."""
-    return [*dict.fromkeys(key for row in rows for key in row)]
-
-
-def as_csv(rows: Sequence[Mapping]) -> str:
-    """Returns rows as CSV; what is None is empty."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, keys_of(rows), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    files["json"] = text
+    folders.write({Path(f"{file}.{ending}"): content for ending, content in files.items()})
+    return Path(f"{file}.json")
 
 
 def grid(rows: Sequence[dict]) -> tuple[list[str], list[list[str]]]:

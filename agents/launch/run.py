@@ -27,7 +27,6 @@ from megastep.agents.launch import again, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training.budget import reaches
 from megastep.agents.training.callbacks import Progress
-from megastep.atomic_files import write_atomically
 from megastep.types import DEFAULTS, optional
 
 if TYPE_CHECKING:
@@ -236,9 +235,8 @@ def evaluations(*arguments: Any) -> Any:
 def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:
     """Writes the settings of an agent that starts to train, and a line about where it does."""
     folder, config = trainer.saver.folder.parent, trainer.saver.config["train"]
-    with user_errors(folders.CANNOT.format(folder)):
-        text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")
-        write_atomically(folder / "config.yaml", text)
+    text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+    folders.write({folder / "config.yaml": text})
     provenance.record(folder, trainer.samples, device, hosts)
 
 

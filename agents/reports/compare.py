@@ -1,6 +1,5 @@
 """Compares runs in one plot, averaged over seeds, and in a table of its numbers."""
 
-import csv
 import functools
 import io
 import math
@@ -14,7 +13,7 @@ import numpy as np
 from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.reports import runs, seeds
-from megastep.atomic_files import write_atomically
+from megastep.agents.runs import folders
 from megastep.settings import closest
 
 #: Endings of plots.
@@ -79,14 +78,10 @@ def write(
         texts += axes.legend(fontsize="small", loc=place).get_texts()
     for text in texts:
         text.set_parse_math(False)  # a $ is a $
-    plot, text = io.BytesIO(), io.StringIO()
+    plot = io.BytesIO()
     figure.savefig(plot, format=file.suffix[1:], dpi=200)
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([["runs", "samples", "mean", "lower", "upper"], *table])
-    with user_errors(f"{file} cannot be written: "):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file.with_suffix(".csv"), text.getvalue().encode())
-        write_atomically(file, plot.getvalue())
+    text = console.as_csv(["runs", "samples", "mean", "lower", "upper"], table)
+    folders.write({file.with_suffix(".csv"): text, file: plot.getvalue()})
     head = [text.format(metric) for text in seeds.POOLED]
     rows = seeds.pooled(scores)
     console.say("\n".join([console.table(head, rows, width=console.terminal_width()), *left_out]))

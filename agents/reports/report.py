@@ -16,14 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from megastep.agents import console
-from megastep.agents.errors import ConfigErrors, UserError, user_errors
+from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.evaluation import tables
 from megastep.agents.evaluation.statistics import SCORES
 from megastep.agents.factory import check, components
 from megastep.agents.factory import make as factory
 from megastep.agents.reports import runs, seeds
 from megastep.agents.runs import checkpoint, folders, populations, trust
-from megastep.atomic_files import write_atomically
 
 HERE = Path(__file__).parent
 #: Most points of a curve.
@@ -59,9 +58,7 @@ def write(paths: Sequence[Path], file: Path) -> Path:
     page = (HERE / "page.html").read_text("utf-8")
     for name, part in parts.items():
         page = page.replace(f"\n{name}\n", f"\n{part}\n", 1).replace(f">{name}<", f">{part}<", 1)
-    with user_errors(f"{file} cannot be written: "):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, page.encode())
+    folders.write({file: page})
     return file
 
 

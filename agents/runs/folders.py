@@ -9,13 +9,14 @@ import re
 import shlex
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megastep.agents import package
 from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.runs import agent_file, checkpoint, trust, typed_json
+from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     import torch
@@ -112,6 +113,14 @@ def record_start(folder: Path) -> None:
     except OSError as error:
         text = f"{STARTED} cannot be written, so `latest` will not find {folder}: {error}"
         warnings.warn(text, stacklevel=2)
+
+
+def write(files: Mapping[Path, str | bytes]) -> None:
+    """Writes files whole, into folders that are made if need be. UserError if one cannot be."""
+    for path, content in files.items():
+        with user_errors(f"{path} cannot be written: "):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, content if isinstance(content, bytes) else content.encode())
 
 
 # ---- Existing folders ----
