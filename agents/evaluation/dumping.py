@@ -161,6 +161,8 @@ class _Actor:
 class Waves:
     """Plays and writes the episodes of a dump: `n_steps` so far, in so many `seconds`."""
 
+    told: _Told  # made once an episode is missing
+
     def __init__(
         self,
         cfg: settings.Dump,
@@ -171,20 +173,16 @@ class Waves:
     ):
         self.cfg, self.loaded, self.n_steps, self.seconds = cfg, loaded, 0, 0.0
         self.where: dict = dict(seed=cfg.seed, device=device)
-        sample = factory.make_sample(env, homes, **self.where)
-        n_agents = optional(sample, "n_agents")
+        self.sample = factory.make_sample(env, homes, **self.where)
+        n_agents = optional(self.sample, "n_agents")
         n_envs = -(-min(cfg.episodes, LANES) // n_agents)
         self.settings = settings.changed(env, n_envs=n_envs)
         is_drawn = getattr(env, "resample", False)
         self.homes = homes if is_drawn else factory.spread(homes, n_envs)
-        tree = {"obs": sample.obs_space, "actions": sample.action_space}
         with factory.errors():
-            texts = {name: repr(space) for name, space in spaces.leaves(tree).items()}
-            self.codec = episodes.Codec(texts)
+            self.codec = episodes.Codec(restore.spaces_of(self.sample))
         self.n_lanes, self.n_agents = n_envs * n_agents, n_agents
-        self.most = cfg.max_steps or optional(sample, "max_episode_steps")
-        self.fps, self._make = optional(sample, "fps"), lambda: self._made(sample)
-        self.told: _Told | None = None
+        self.most = cfg.max_steps or optional(self.sample, "max_episode_steps")
 
     def about(self, env: settings.Env, geometry: settings.Geometry) -> dict[str, Any]:
         """Returns what the dataset's file says."""
@@ -193,19 +191,19 @@ class Waves:
         chosen["player"] = cfg.bot if self.loaded is None else eval_env.name_of(self.loaded)
         chosen |= dict(env=check.as_tree(env), geometry=check.as_tree(geometry))
         texts = {path: repr(space) for path, space in self.codec.spaces.items()}
-        about = dict(writer=data.WRITER, format=cfg.format, fps=float(self.fps))
-        return dict(about, spaces=texts, settings=chosen)
+        about = dict(writer=data.WRITER, format=cfg.format)
+        about |= dict(fps=float(optional(self.sample, "fps")), spaces=texts)
+        return dict(about, settings=chosen)
 
-    def _made(self, sample, seed=None) -> None:
+    def _make(self, **seed: int) -> None:
         """Makes the environment, who plays in it, and what collects."""
-        where = self.where if seed is None else self.where | {"seed": seed}
-        env = factory.construct(self.settings, geometries=self.homes, **where)
+        env = factory.construct(self.settings, geometries=self.homes, **{**self.where, **seed})
         if self.loaded is not None:
             policy: PolicyLike = restore.policy_of(self.loaded, env)
             restore.load_wrappers(env, self.loaded)
         else:
             name = None if self.cfg.bot == "bot" else self.cfg.bot
-            policy = factory.make_bot(name, self.settings, sample)
+            policy = factory.make_bot(name, self.settings, self.sample)
             policy = factory.in_env(policy, self.settings, env)
         self.told, self.actor = _Told(env, self.cfg.truth), _Actor(policy, self.cfg.greedy)
         state = self.actor.initial(self.n_lanes, env.device)
@@ -219,15 +217,14 @@ class Waves:
     def _begin(self, wave) -> None:
         """Begins episodes that depend on the seed and the wave's number alone."""
         seed = stream_seed(self.cfg.seed, f"wave {wave}")
-        if self.told is None:
+        if not hasattr(self, "told"):
             self._make()
-        assert self.told is not None
         if takes_masks(self.told.env):
             world = self.told.reset(seed=seed)
         else:
             if wave:
                 optional(self.told.env, "close")()
-                self._made(self.told.env, seed % 2**31)
+                self._make(seed=seed % 2**31)
             world = self.told.reset()
         device = world["reset"].device
         start = self.collect.parts[-1]
@@ -238,7 +235,6 @@ class Waves:
     def play(self, wave: int) -> tuple[dict[str, torch.Tensor], np.ndarray, np.ndarray | None]:
         """Plays a wave. Returns its arrays (B, T + 1, ...), lengths (B,) and layouts (B,)."""
         self._begin(wave)
-        assert self.told is not None
         layout = optional(self.told.env, "layout")
         layout = None if layout is None else layout.repeat_interleave(self.n_agents).cpu().numpy()
         parts, lengths = [], np.zeros(self.n_lanes, np.int64)
@@ -274,7 +270,6 @@ class Waves:
             is_obs = path.startswith("obs")
             part[name] = self.codec.encode(path, leaves[path][rows] if is_obs else leaves[path])
         part |= {name: getattr(rollout, name) for name in ("reward", "terminal", "truncated")}
-        assert self.told is not None
         for name, leaf in rollout.obs["truth"].items():
             part[name] = leaf[rows].unflatten(-1, self.told.shapes[name])[:, :, 0]
         if rollout.mask is not None:

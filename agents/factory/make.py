@@ -19,7 +19,7 @@ from megastep.agents.hardware import make_device as make_device
 from megastep.agents.hardware import share_threads
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import checkpoint, folders, restore
-from megastep.agents.runs.saver import check_plain
+from megastep.agents.runs.saver import check_plain, nbytes
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training import loggers
@@ -149,7 +149,7 @@ def check_memory(
     options = with_defaults(learner, LearnerOptions)
     n_bytes = options.bytes_per_env(sample)
     n, each = options.replay_size(sample)
-    total = _nbytes(sample)
+    total = nbytes(state_tree(sample))
     with errors():
         engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
         n_bytes += n * each / env.n_envs
@@ -159,7 +159,7 @@ def check_memory(
             if env.n_envs > PROBE:  # fewer tell for themselves whether they fit
                 probe = settings.changed(env, n_envs=PROBE)
                 probe = construct(probe, geometries=geometries[:1], **arguments)
-                n_bytes += (_nbytes(probe) - total) / (PROBE - sample.n_envs)
+                n_bytes += (nbytes(state_tree(probe)) - total) / (PROBE - sample.n_envs)
                 engine.fit(n_things, n_each * n_bytes, sample.device, what)
             elif n_members > 1:
                 raise
@@ -250,7 +250,3 @@ def config_of(loaded: checkpoint.Checkpoint) -> Trained:
     tree = {key: train[key] for key in Trained.__dataclass_fields__ if key in train}
     with user_errors(f"{loaded.path} cannot be used: ", (ConfigErrors,)):
         return check.check(Trained, tree)
-
-
-def _nbytes(env) -> int:
-    return sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())

@@ -31,7 +31,6 @@ from megastep.agents.distributed.ranks import world
 from megastep.agents.population import decisions
 from megastep.agents.runs import json_lines, populations
 from megastep.agents.training.episode_stats import MIN_EPISODES
-from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import optional
 
 if TYPE_CHECKING:
@@ -278,8 +277,8 @@ class Population:
         if learnt is None:
             return
         trainer = self._trainer(target)
-        copy_from = with_defaults(trainer.learner, LearnerOptions).copy_from
-        assert copy_from is not None
+        copy_from = trainer.learner_options.copy_from
+        assert copy_from is not None  # as `make_trainer` asks
         copy_from(learnt.learner)
         if learnt.wrappers:
             optional(trainer.env, "load_wrapper_state")(learnt.wrappers, False)

@@ -89,7 +89,7 @@ class Saver:
 
     def _with_replay(self, state, is_last) -> StateDict:
         """Returns the state, without a large replay buffer that is not due or cannot be copied."""
-        self.lacks_replay, n_bytes = False, _nbytes(state.get("replay"))
+        self.lacks_replay, n_bytes = False, nbytes(state.get("replay"))
         if n_bytes <= SMALL_REPLAY:
             return state
         self._n_since_replay += 1
@@ -122,7 +122,7 @@ class Saver:
                 what = step, state, self.config, self.keep_checkpoints, score, self.made_with
                 checkpoint.save(self.folder, *what, self._collect)
         except Exception as error:
-            self._failure = step, _nbytes(state), error
+            self._failure = step, nbytes(state), error
 
     def _rank_file(self, rank) -> Path:
         return self.folder / f".rank{rank}-{self.launch}-{self._number}"
@@ -203,5 +203,6 @@ def check_plain(tree: object, name: str) -> None:
         )
 
 
-def _nbytes(state) -> int:
+def nbytes(state: object) -> int:
+    """Returns the bytes of the tensors in a tree."""
     return sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))

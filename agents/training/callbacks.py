@@ -19,15 +19,12 @@ import torch
 from megastep.agents import console
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.process_group import rank_label
-from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.runs.saver import Saver
     from megastep.agents.training.trainer import Trainer
-    from megastep.agents.types import Learner, RolloutLike
 
 #: The methods, and what each gets beside the trainer.
 HOOKS = {
@@ -176,38 +173,34 @@ class NonFiniteGuard:
     """
 
     tolerates_divergence = has_diverged = False
-
-    def __init__(self, env: Env, learner: Learner, ranks: Ranks = ONE):
-        self.learner, self.ranks = learner, ranks
-        self.n_agents = optional(env, "n_agents")
-        self.nonfinite_check = with_defaults(learner, LearnerOptions).check
-        self.value = None
+    value: Any = None
 
     def on_report(self, trainer: Trainer, metrics: object) -> None:
         """Checks the last update."""
-        self.check(trainer.rollout)
+        self.check(trainer)
 
     def may_save(self, trainer: Trainer) -> bool:
         """Returns whether the last update was applied, or the policy is about to be replaced."""
-        return self.tolerates_divergence or self.check(trainer.rollout)
+        return self.tolerates_divergence or self.check(trainer)
 
-    def check(self, rollout: RolloutLike) -> bool:
+    def check(self, trainer: Trainer) -> bool:
         """Returns whether the last update was applied. NonFiniteError: many were skipped."""
-        if self.nonfinite_check is None:
+        rollout, nonfinite_check = trainer.rollout, trainer.learner_options.check
+        if nonfinite_check is None:
             return True
-        value, n_skipped = self.nonfinite_check.read(rollout.floats())
+        value, n_skipped = nonfinite_check.read(rollout.floats())
         if value:
             stored = rollout.learners  # of the environment's lanes
             lanes = range(rollout.n_lanes) if stored is None else stored.nonzero()[:, 0].tolist()
-            value = value.in_env(lanes, self.n_agents)
+            value = value.in_env(lanes, optional(trainer.env, "n_agents"))
         is_bad = value is not None or n_skipped > 0
-        reports = self.ranks.gather_if_any((n_skipped, value, rank_label()), is_bad)
+        reports = trainer.ranks.gather_if_any((n_skipped, value, rank_label()), is_bad)
         n_skipped = max(report[0] for report in reports)
         _, value, label = next((one for one in reports if one[1]), reports[0])
         text = f"{value}{f' ({label})' * (len(reports) > 1)}"
         if value and self.value is None:
             self.value = value
-            if self.ranks.rank == 0:
+            if trainer.ranks.rank == 0:
                 warnings.warn(f"{text}; its rollout was skipped", stacklevel=2)
         self.has_diverged = n_skipped >= MAX_SKIPPED
         if not self.has_diverged:
@@ -215,7 +208,7 @@ class NonFiniteGuard:
         is_from_env = value is not None and value.is_from_env
         if self.tolerates_divergence and not is_from_env:
             return False
-        advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
+        advice = f"The policy diverged: try a learning rate smaller than {trainer.learner.lr:g}"
         if value is not None and is_from_env:
             advice = f"It came from the environment: check how it computes {value.name}"
         raise NonFiniteError(

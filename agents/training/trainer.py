@@ -86,7 +86,7 @@ class Trainer:
         self.lost: list[str] = []
         self.curriculum: Any = None
         self.timing, self.tuning, self.episodes = Timing(env.device), Tuning(self), Episodes(self)
-        self.nonfinite_guard = NonFiniteGuard(env, learner, self.ranks)
+        self.nonfinite_guard = NonFiniteGuard()
         standard = [self.timing, self.tuning, self.episodes, Losses()]
         self.callbacks = Callbacks([*standard, *callbacks, self.nonfinite_guard])
         self.run_state = RunState(self)

@@ -55,7 +55,7 @@ def test_nan_of_another_rank_is_told_by_rank_0(tmp_path, one_by_one, recwarn):
     for rank, faults in ((1, {("reward", 2, 3): torch.nan}), (0, {})):
         run = make_trainer(tmp_path, faults, ranks=one_by_one(rank))
         run.update()
-        assert not run.nonfinite_guard.check(run.rollout)
+        assert not run.nonfinite_guard.check(run)
         trainers.append(run)
     (warning,) = recwarn
     sentence = r"reward of lane 3 was nan at step 2 \(rank 1 on there\); its rollout was skipped"
