@@ -27,29 +27,21 @@ class Theme:
     wall: tuple[float, float]  # least and greatest brightness of walls
 
 
+#: Fields of the themes "light" and "dark".
+FIELDS: dict = {
+    "page": ("#ffffff", "#12161d"),
+    "text": ("#1d2430", "#eef1f6"),
+    "faint": ("#6b7483", "#98a2b3"),
+    "outside": ("#dde1e8", "#171c25"),
+    "floor": ("#fffdf6", "#394353"),
+    "unseen": ("#e9ebef", "#252c38"),
+    "hatch": ("#d3d7de", "#303846"),
+    "unseen_wall": ("#a9b0bc", "#566073"),
+    "wall": ((0.25, 0.8), (0.55, 1.0)),
+}
 THEMES = {
-    "light": Theme(
-        page="#ffffff",
-        text="#1d2430",
-        faint="#6b7483",
-        outside="#dde1e8",
-        floor="#fffdf6",
-        unseen="#e9ebef",
-        hatch="#d3d7de",
-        unseen_wall="#a9b0bc",
-        wall=(0.25, 0.8),
-    ),
-    "dark": Theme(
-        page="#12161d",
-        text="#eef1f6",
-        faint="#98a2b3",
-        outside="#171c25",
-        floor="#394353",
-        unseen="#252c38",
-        hatch="#303846",
-        unseen_wall="#566073",
-        wall=(0.55, 1.0),
-    ),
+    theme: Theme(**{name: values[i] for name, values in FIELDS.items()})
+    for i, theme in enumerate(("light", "dark"))
 }
 
 
