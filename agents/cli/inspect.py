@@ -43,10 +43,7 @@ def _lines(path: Path) -> Iterator[str]:
     """Yields the text about a checkpoint."""
     manifest = checkpoint.read_manifest(path)
     loaded = checkpoint.read(path, "cpu", is_whole=True)
-    try:
-        written = datetime.datetime.fromtimestamp((path / "manifest.json").stat().st_mtime)
-    except FileNotFoundError:
-        raise checkpoint.DamagedCheckpoint(path, "") from None
+    written = datetime.datetime.fromtimestamp((path / "manifest.json").stat().st_mtime)
     yield f"{path}: intact, format {manifest['format']}, written {written:%Y-%m-%d %H:%M:%S}"
     yield f"  {'; '.join(f'{name} {value:,.6g}' for name, value in loaded.numbers.items())}"
     if loaded.made_with:

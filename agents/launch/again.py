@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from typing import NamedTuple
 
 from megastep.agents.errors import ConfigErrors, shortened
 from megastep.agents.factory import check, settings
@@ -21,14 +20,6 @@ RESUMABLE = (
 ).split()
 
 
-class Start(NamedTuple):
-    """How to start or continue a run."""
-
-    cfg: settings.Train  # `resume` is still `AUTO` if the run has saved nothing yet
-    folder: Path
-    ended: str | None = None  # why nothing is left to do, such as `used up its budget`
-
-
 def with_more(cfg: settings.Train) -> settings.Train:
     """Returns `cfg` with more_samples and more_seconds turned into totals of the resumed run."""
     totals = {}
@@ -39,8 +30,10 @@ def with_more(cfg: settings.Train) -> settings.Train:
     return settings.changed(cfg, **totals)
 
 
-def automatic(cfg: settings.Train) -> Start:
-    """Returns how `resume=auto` begins. ConfigErrors if a setting outside `RESUMABLE` differs."""
+def automatic(cfg: settings.Train) -> tuple[settings.Train, str | None]:
+    """Returns the settings with which `resume=auto` begins, `AUTO` still if nothing was saved, and
+    why nothing is left to do, if so. ConfigErrors if a setting outside `RESUMABLE` differs.
+    """
     for key in ("more_samples", "more_seconds"):
         if getattr(cfg, key) is not None:
             text = f"would be added each time; with resume=auto give the total, {key[5:]}="
@@ -54,7 +47,7 @@ def automatic(cfg: settings.Train) -> Start:
         raise ConfigErrors([("folder", text)])
     if not checkpoint.list_checkpoints(folder / "checkpoints"):  # whole or damaged
         folders.check_free(str(folder), is_again=True)
-        return Start(settings.changed(cfg, folder=str(folder)), folder)
+        return settings.changed(cfg, folder=str(folder)), None
     loaded = folders.load_checkpoint(folders.find(str(folder)), cfg.trust)
     typed, before = check.as_tree(cfg), dict(check.leaves(loaded.config["train"]))
     free, errors = {*RESUMABLE, "folder", "init"}, []
@@ -73,4 +66,4 @@ def automatic(cfg: settings.Train) -> Start:
         ended = "used up its budget"
     if reaches(evaluation_in(numbers), cfg.evaluation.stop):
         ended = "reached its stop"
-    return Start(settings.changed(cfg, resume=str(folder), folder=None, init=None), folder, ended)
+    return settings.changed(cfg, resume=str(folder), folder=None, init=None), ended

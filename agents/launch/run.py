@@ -62,11 +62,10 @@ class Run:
     def run(self) -> Path:
         """Opens or continues the run, trains, finishes. Interrupted after a signal, once saved."""
         if self.cfg.resume == again.AUTO:
-            start = together(lambda: again.automatic(self.cfg))
-            if start.ended:
-                console.say(f"The run in {start.folder} has already {start.ended}.")
-                return start.folder
-            self.cfg = start.cfg
+            self.cfg, ended = together(lambda: again.automatic(self.cfg))
+            if ended:
+                console.say(f"The run in {self.cfg.resume} has already {ended}.")
+                return Path(str(self.cfg.resume))
         with contextlib.ExitStack() as locks:
             self.start(locks)
             # of a signal to all ranks, the first to get it stops them, and others get it later

@@ -47,6 +47,8 @@ class Hosted:
 
     HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
     max_episode_steps: int | None = None
+    _begin: Callable  # (e, settings) and (e, actions) -> None, of subclasses
+    _step: Callable
 
     def __init__(
         self,
@@ -94,12 +96,6 @@ class Hosted:
             raise EnvError.of(error, self._name(e)) from error
         obs = concatenate(self.single_observation_space, self.latest, self.batch)
         return obs, self.rewards, self.terminated, self.truncated, self.infos
-
-    def _begin(self, e, settings) -> None:
-        raise NotImplementedError
-
-    def _step(self, e, chosen) -> None:
-        raise NotImplementedError
 
     def _name(self, e) -> str:
         return f"environment {self.first + e}"
