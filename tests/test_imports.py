@@ -164,7 +164,7 @@ OUTSIDE_USERS = {
     ),
     "minari": ("megastep/data/formats.py",),
     "omegaconf": ("agents/cli/*.py",),
-    "openskill": ("agents/evaluation/ratings.py",),
+    "openskill": ("agents/evaluation/evaluate_run.py",),
     "pettingzoo": ("megastep/adapters/parallel_env.py", "megastep/hosting/hosted.py"),
     "pandas": ("megastep/data/formats.py",),
     "pyarrow": ("megastep/data/formats.py",),

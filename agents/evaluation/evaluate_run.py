@@ -1,11 +1,16 @@
 """Measures a trained policy on unseen homes, or against others in duels."""
 
+import itertools
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from megastep.agents import console
 from megastep.agents.distributed import process_group
-from megastep.agents.evaluation import eval_env, playing, ratings, statistics, tables
+from megastep.agents.errors import UserError
+from megastep.agents.evaluation import eval_env, playing, statistics, tables
 from megastep.agents.evaluation.eval_env import EvalEnv, Player
 from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.factory import make as factory
@@ -14,6 +19,14 @@ from megastep.agents.types import Row
 from megastep.types import optional
 
 ORACLE = "oracle"  # the bot that knows where everything is
+#: Number of orders that ratings are averaged over.
+N_ORDERS = 10
+
+#: Scores of player i in duels with player j, by (i, j): 1 won, 0 lost, 0.5 a draw.
+Scores = Mapping[tuple[int, int], Sequence[float]]
+
+#: Columns of the table, and the forms of their numbers.
+COLUMNS = dict(player="", rating=".2f", sigma=".2f", won=".3f", duels="")
 
 
 def run(cfg: settings.Evaluate) -> Path:
@@ -24,13 +37,12 @@ def run(cfg: settings.Evaluate) -> Path:
     start, device = time.monotonic(), factory.make_device(cfg.device)
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
     env_settings, geometry, homes = factory.played_in(cfg, loaded)
-    folder, rank = folders.folder_of(loaded.path), process_group.rank()
     options: dict = dict(episodes=cfg.episodes, seed=cfg.seed, device=device)
     options["is_duel"] = cfg.ratings or cfg.against is not None
-    with env_failures.caught(env_settings, folder, rank=rank):
+    with env_failures.caught(env_settings, folders.folder_of(loaded.path)):
         if cfg.ratings:
             where = EvalEnv(env_settings, homes, **options)
-            path = ratings.write(cfg, loaded, where, geometry)
+            path = write_ratings(cfg, loaded, where, geometry)
         else:
             path = _measure(cfg, loaded, env_settings, geometry, homes, options)
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
@@ -128,3 +140,74 @@ def _play(
 def _rows(where, played, source) -> list[Row]:
     sources = factory.sources_of(where.homes) if source is None else None
     return statistics.summaries(played, optional(where.env, "roles"), sources)
+
+
+# ---- Ratings of players from the results of their duels ----
+
+
+def write_ratings(
+    cfg: settings.Evaluate, run: checkpoint.Checkpoint, where: EvalEnv, geometry: settings.Geometry
+) -> Path:
+    """Rates a run's snapshots, and others, by duels of each with each; writes ratings.csv.
+
+    A rating of openskill, by the Plackett-Luce model of Weng and Lin (JMLR 12, 2011), is a mean,
+    which starts at 25, and a standard deviation. Rated 5.9 higher, a player wins 73 % of duels.
+    """
+    folder, players = folders.folder_of(run.path), []
+    for path in (
+        checkpoint.list_checkpoints(folder / "snapshots")
+        or checkpoint.list_checkpoints(folder / "checkpoints")
+        or [run.path]  # the file of an agent
+    ):
+        try:
+            (player,) = where.players([str(path)], run, cfg.trust)
+        except UserError:
+            if path.exists():
+                raise
+            continue  # its run, which is training, has deleted it
+        players.append(player._replace(name=f"{player.step:,} samples"))
+    players += where.players(cfg.against or (), run, cfg.trust)
+    if len(players) < 2:
+        raise UserError(
+            f"{folder} has one checkpoint and nothing to compare it with: train with "
+            "checkpoints.snapshots=8, or name others with against="
+        )
+    where.warn_without_layout()
+    pairs = [*itertools.combinations(range(len(players)), 2)]
+    played = {(i, j): where.duel(cfg, run, players[i], players[j]) for i, j in pairs}
+    if process_group.rank() > 0:
+        return folder
+    scores = {pair: one["score"].tolist() for pair, one in played.items()}
+    table = []
+    for k, (mean, sigma) in enumerate(rate(len(players), scores, cfg.seed)):
+        results = [score for (i, _), values in scores.items() if i == k for score in values]
+        results += [1 - score for (_, j), values in scores.items() if j == k for score in values]
+        about = dict(player=players[k].name, samples=players[k].step, rating=mean, sigma=sigma)
+        table.append(about | dict(won=sum(results) / len(results), duels=len(results)))
+    layouts, what = played[0, 1].get("homes"), f"{where.shard.n_envs:,} duels of each pair"
+    n_homes = None if layouts is None else len(layouts.unique())
+    title = tables.title_of(where, geometry, cfg.split, what, n_homes)
+    title = f"Ratings in {title}, seed {cfg.seed}"
+    cells = [[format(row[name], form) for name, form in COLUMNS.items()] for row in table]
+    console.say(f"{title}\n{console.table([*COLUMNS], cells)}")
+    rows = [[*row.values()] for row in table]
+    folders.write({folder / "ratings.csv": console.as_csv([*table[0]], rows)})
+    return folder / "ratings.csv"
+
+
+def rate(n_players: int, scores: Scores, seed: int = 1) -> list[tuple[float, float]]:
+    """Returns (mean, standard deviation) of each player's rating, over random orders of duels."""
+    from openskill.models import PlackettLuce
+
+    duels = [(i, j, score) for (i, j), values in scores.items() for score in values]
+    generator, model = np.random.default_rng(seed), PlackettLuce(tau=0.0)  # strengths do not drift
+    ratings = []
+    for _ in range(N_ORDERS):
+        players = [model.rating() for _ in range(n_players)]
+        for k in generator.permutation(len(duels)):
+            i, j, score = duels[k]
+            [players[i]], [players[j]] = model.rate(
+                [[players[i]], [players[j]]], scores=[score, 1 - score]
+            )
+        ratings.append([(player.mu, player.sigma) for player in players])
+    return [(float(mean), float(sigma)) for mean, sigma in np.mean(ratings, 0)]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from megastep import engine
+from megastep.agents.distributed import process_group
 from megastep.agents.errors import UserError, memory_problem
 from megastep.agents.factory.settings import Env
 from megastep.hosting.env_error import EnvError, one_line
@@ -24,9 +25,7 @@ class EnvFailed(UserError):
 
 
 @contextlib.contextmanager
-def caught(
-    env: Env, folder: Path, saved: Callable[[], str] = lambda: "", rank: int = 0
-) -> Iterator[None]:
+def caught(env: Env, folder: Path, saved: Callable[[], str] = lambda: "") -> Iterator[None]:
     """Turns errors of others' environments into EnvFailed, their traceback in a file."""
     try:
         yield
@@ -36,6 +35,7 @@ def caught(
         is_sentence = isinstance(error, UserError)  # that a video could not be made because of it
         text = [str(error if is_sentence else failure).rstrip("."), saved()]
         if failure.trace:
+            rank = process_group.rank()
             path = folder / (f"rank_{rank}_{FILE}" if rank else FILE)
             with contextlib.suppress(OSError):
                 path.write_text(failure.trace, "utf-8", "backslashreplace")

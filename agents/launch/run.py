@@ -90,7 +90,7 @@ class Run:
             token = check_shared(self.folder) if self.n_ranks > 1 else ""
             if self.team:
                 self.team.set_folder(self.folder)
-            caught = env_failures.caught(self.cfg.env, self.folder, rank=process_group.rank())
+            caught = env_failures.caught(self.cfg.env, self.folder)
             try:
                 together(caught(lambda: self.make(source, token)))
             except env_failures.EnvFailed:
@@ -146,7 +146,7 @@ class Run:
         """Trains, and turns what may happen into a sentence."""
         try:
             with (
-                env_failures.caught(self.cfg.env, self.folder, self.saved, process_group.rank()),
+                env_failures.caught(self.cfg.env, self.folder, self.saved),
                 signals.handled(signals.announce) as numbers,
                 self.around(),
                 self.progress if self.is_first else contextlib.nullcontext(),

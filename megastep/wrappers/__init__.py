@@ -1,13 +1,13 @@
 """Wrappers around any environment, on its device: `env.wrappers=[sticky_actions]`."""
 
-from megastep.wrappers.actions import NoisyActions, StickyActions, TimeLimit
+from megastep.wrappers.actions import Latency, NoisyActions, StickyActions, TimeLimit
 from megastep.wrappers.base import Wrapper
-from megastep.wrappers.robots import Latency, OdometryDrift
 from megastep.wrappers.worlds import (
     ClipReward,
     DropSensor,
     FrameStack,
     NoisySensor,
+    OdometryDrift,
     ScaleReward,
     ShapeReward,
 )

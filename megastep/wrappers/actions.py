@@ -12,7 +12,7 @@ from megastep.settings import checked
 from megastep.types import Env, Tree, n_lanes
 from megastep.wrappers.base import Draws, Levels, Unmasked, Wrapper, along, zero_actions
 
-__all__ = ["NoisyActions", "StickyActions", "TimeLimit"]
+__all__ = ["Latency", "NoisyActions", "StickyActions", "TimeLimit"]
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -144,3 +144,50 @@ class TimeLimit(Wrapper):
         ends = world.terminal | world.truncated
         self.is_cut.copy_((self.ages >= self.n) & ~ends & ~world.reset)
         return arrdict(world, truncated=world.truncated | self.is_cut)
+
+
+class Latency(Unmasked):
+    """Takes each action some steps late. Until then an episode's actions are 0.
+
+    Args:
+        env: the environment inside, without action masks.
+        n: steps.
+        per_episode: each episode has a delay of its own, from 0 to n.
+        seed: of the draws.
+    """
+
+    @checked
+    def __init__(
+        self,
+        env: Env,
+        *,
+        n: Annotated[int, Field(ge=1, le=1000)] = 1,
+        per_episode: bool = False,
+        seed: int = 1,
+    ):
+        super().__init__(env)
+        self.n, self.draws = n, Draws(env, (), seed) if per_episode else None
+        self.delays = torch.full((n_lanes(env),), n, device=env.device)
+        self.last = zero_actions(env, n + 1)  # the newest first
+
+    def before(self, actions: Tree) -> Tree:
+        """Returns the actions of some steps ago."""
+
+        def delay(_, last, new) -> torch.Tensor:
+            last.copy_(torch.cat([new[:, None].to(last.dtype), last[:, :-1]], 1))
+            index = along(self.delays, last).expand(-1, 1, *last.shape[2:])
+            return last.gather(1, index)[:, 0]
+
+        return spaces.map(delay, self.action_space, self.last, actions)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Forgets actions, and draws delays, where episodes begin."""
+        world = super().after(world)
+        if self.draws is not None:
+            self.delays.copy_(self.draws(world.reset)[:, 0] * (self.n + 1))
+
+        def forget(_, last) -> torch.Tensor:
+            return last.masked_fill_(along(world.reset, last), 0)
+
+        spaces.map(forget, self.action_space, self.last)
+        return world

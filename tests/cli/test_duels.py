@@ -11,7 +11,7 @@ import torch
 
 from megastep import recording
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.evaluation import playing, ratings, statistics
+from megastep.agents.evaluation import evaluate_run, playing, statistics
 from megastep.agents.evaluation.statistics import interval
 from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
@@ -157,7 +157,7 @@ def test_ratings_match_the_model():
         for i in range(4)
         for j in range(i)
     }
-    means = [mean for mean, _ in ratings.rate(4, scores)]
+    means = [mean for mean, _ in evaluate_run.rate(4, scores)]
     assert sorted(range(4), key=means.__getitem__) == [1, 2, 0, 3]
     assert np.diff(np.sort(means)) == pytest.approx([gap] * 3, abs=1)  # a standard deviation
 
