@@ -3,16 +3,14 @@
 import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser import overrides_parser, types
 from hydra.errors import HydraException
 
 from megastep.agents.errors import ConfigErrors, shortened
 from megastep.agents.factory.check import Tree
-
-if TYPE_CHECKING:
-    from hydra.core.config_loader import ConfigLoader
 
 #: An element of a value with = in it, as folders of sweeps have, and what quotes it.
 WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
@@ -32,7 +30,7 @@ def parse(
     words: Iterable[str],
     kind: Any,
     cure: Callable[[str], str] = str,
-    loader: "ConfigLoader | None" = None,
+    loader: ConfigLoader | None = None,
 ) -> list[types.Override]:
     """Returns words as Hydra's grammar reads them. ConfigErrors with all unreadable ones."""
     parser = overrides_parser.OverridesParser.create(loader)

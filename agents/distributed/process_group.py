@@ -4,8 +4,6 @@ torchrun, or `ranks=` on the command line, starts the ranks and sets their envir
 Every function that exchanges something waits for the other ranks. R ranks.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import datetime
@@ -16,15 +14,13 @@ import os
 import pickle
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TypeVar, cast
 
 import torch
 from torch import distributed
+from torch.distributed import Store, TCPStore  # pyright: ignore[reportPrivateImportUsage]
 
 from megastep.agents.distributed.environment import hostname, rank_info
-
-if TYPE_CHECKING:
-    from torch.distributed import Store, TCPStore  # pyright: ignore[reportPrivateImportUsage]
 
 T = TypeVar("T")
 
@@ -74,7 +70,7 @@ def _store() -> Store:
 
 
 def _connection(is_master=False) -> TCPStore:
-    return distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
+    return TCPStore(
         os.environ["MASTER_ADDR"],
         int(os.environ["MASTER_PORT"]),
         is_master=is_master,

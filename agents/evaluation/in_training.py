@@ -1,10 +1,11 @@
 """Evaluations of a policy while it trains."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from megastep import global_generators
+from megastep.agents.distributed.ranks import Ranks
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.evaluation import playing
 from megastep.agents.evaluation.eval_env import EvalEnv
@@ -12,13 +13,10 @@ from megastep.agents.factory import make as factory
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
 from megastep.agents.training.budget import reaches
+from megastep.agents.training.trainer import Trainer
 from megastep.env_state import way_back
 from megastep.settings import closest
 from megastep.types import Env, optional
-
-if TYPE_CHECKING:
-    from megastep.agents.distributed.ranks import Ranks
-    from megastep.agents.training.trainer import Trainer
 
 
 class Evaluations:
@@ -34,7 +32,7 @@ class Evaluations:
         ranks: those that train the policy, which share the episodes.
     """
 
-    def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device, ranks: "Ranks"):
+    def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device, ranks: Ranks):
         homes, n = factory.homes(cfg.env, cfg.geometry, "test"), cfg.evaluation.episodes
         self.every, self.unit = settings.every(cfg.evaluation.every or 1)
         self.stop, self.last = cfg.evaluation.stop, {"samples": 0.0, "seconds": 0.0}
@@ -50,17 +48,17 @@ class Evaluations:
                 text = f"no evaluation here measures it; {closest(name, names)}"
                 raise ConfigErrors([(f"evaluation.stop.{name}", text)])
 
-    def on_start(self, trainer: "Trainer") -> None:
+    def on_start(self, trainer: Trainer) -> None:
         """Ends a run that has reached its end before."""
         self.last = {"samples": trainer.samples_at_report, "seconds": trainer.clock.seconds}
         if reaches(trainer.evaluation, self.stop):
             trainer.end()
 
-    def on_update(self, trainer: "Trainer", losses: object) -> None:
+    def on_update(self, trainer: Trainer, losses: object) -> None:
         """Forgets the score: it was another policy's."""
         trainer.score = None
 
-    def on_measure(self, trainer: "Trainer", metrics: dict[str, Any]) -> None:
+    def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
         """Evaluates if it is time to, which all ranks do at once.
 
         Metrics:
@@ -80,7 +78,7 @@ class Evaluations:
         trainer.score, trainer.is_save_due = trainer.evaluation.get("return"), True
         metrics |= {f"eval/{name}": value for name, value in trainer.evaluation.items()}
 
-    def on_report(self, trainer: "Trainer", metrics: dict[str, Any]) -> None:
+    def on_report(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
         """Ends the run if the evaluation reaches `stop`."""
         if trainer.is_save_due and reaches(trainer.evaluation, self.stop):
             metrics["perf/seconds_to_stop"] = metrics["perf/seconds"]

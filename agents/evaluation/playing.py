@@ -80,11 +80,7 @@ def _has_fixed_form(before, after) -> bool:
 
 @torch.no_grad()
 def first_episodes(
-    env: Env,
-    policy: PolicyLike,
-    seed: int = 1,
-    greedy: bool = False,
-    max_steps: int | None = None,
+    env: Env, policy: PolicyLike, seed: int = 1, greedy: bool = False, max_steps: int | None = None
 ) -> arrdict:
     """Plays the first episode of each lane that learns, or of all lanes if none does.
 

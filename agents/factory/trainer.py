@@ -6,7 +6,7 @@ import random
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -23,12 +23,9 @@ from megastep.agents.runs.saver import Saver
 from megastep.agents.training import budget, loggers
 from megastep.agents.training.callbacks import Snapshots
 from megastep.agents.training.trainer import Trainer
-from megastep.agents.types import LearnerOptions, with_defaults
+from megastep.agents.types import LearnerOptions, Row, with_defaults
 from megastep.imports import import_object
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
-    from megastep.types import Env
+from megastep.types import Env
 
 
 def make_trainer(
@@ -103,7 +100,7 @@ def make_trainer(
 
                 observers.append(Profiler(folder, cfg.logging.profile, device))
         trainer = Trainer(
-            cast("Env", opponents or env),
+            cast(Env, opponents or env),
             policy,
             learner,
             limits,
@@ -164,7 +161,7 @@ def state_errors(path: Path) -> Iterator[None]:
         raise UserError(f"The state in {path} is not this run's: {problem}") from error
 
 
-def differing(before: "Row", now: "Row") -> list[str]:
+def differing(before: Row, now: Row) -> list[str]:
     """Returns a clause for each of the things that a run's bits depend on that has changed."""
     before, now = {"ranks": 1, **before}, {"ranks": 1, **now}
     changed = {name: value for name, value in before.items() if value != now.get(name)}

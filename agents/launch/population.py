@@ -1,13 +1,11 @@
 """The run of a population: several agents in one process that take over from each other."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from megastep import engine
 from megastep.agents import console
@@ -28,9 +26,6 @@ from megastep.agents.training.callbacks import Progress
 from megastep.agents.training.episode_stats import MIN_EPISODES
 from megastep.settings import closest
 
-if TYPE_CHECKING:
-    from megastep.agents.launch.watch import Team
-
 #: Checkpoints that a member keeps at least: while one is being written, and the one before may be
 #: unfinished elsewhere, all members have the one before that.
 KEPT = 3
@@ -46,14 +41,11 @@ class PopulationRun(Run):
     of_each = " of each member"
     training: Population
 
-    def __init__(self, cfg: settings.Train, team: Team | None):
-        super().__init__(cfg, team)
-        if (n := self.n_ranks) > (size := cfg.population.size):
+    def open(self, locks: contextlib.ExitStack) -> tuple[Path, Any]:
+        self.title = f"Training {(size := self.cfg.population.size)} members"
+        if (n := self.n_ranks) > size:
             text = f"{n} is more than the {size} members of the population"
             raise ConfigErrors([("ranks", f"{text}; use population.size={n} or more")])
-        self.title = f"Training {size} members"
-
-    def open(self, locks: contextlib.ExitStack) -> tuple[Path, Any]:
         if self.cfg.resume is None:
             return super().open(locks)
         root = folders.folder_of(folders.find(self.cfg.resume, None))

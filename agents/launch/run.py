@@ -1,7 +1,5 @@
 """A run: its folder and lock, its start, training, what ends it, and what follows."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os
@@ -27,11 +25,11 @@ from megastep.agents.launch import again, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training.budget import reaches
 from megastep.agents.training.callbacks import Progress
+from megastep.agents.training.trainer import Trainer
 from megastep.types import DEFAULTS, optional
 
 if TYPE_CHECKING:
     from megastep.agents.launch.watch import Team
-    from megastep.agents.training.trainer import Trainer
 
 #: Seconds within which a file of rank 0 must be visible on the other machines.
 SHARED_SECONDS = 10.0
@@ -53,7 +51,7 @@ class Run:
     training: Any
     trainers: Sequence[Trainer]
 
-    def __init__(self, cfg: settings.Train, team: Team | None):
+    def __init__(self, cfg: settings.Train, team: "Team | None"):
         self.cfg, self.team = cfg, team
         self.is_first, self.n_ranks = process_group.rank() == 0, process_group.n_ranks()
         self.device = together(lambda: factory.make_device(cfg.device))

@@ -20,9 +20,7 @@ def iqm(scores: ArrayLike) -> float:
 
 
 def interval(
-    scores: Sequence[ArrayLike],
-    statistic: Callable[[np.ndarray], float] = iqm,
-    level: float = 0.95,
+    scores: Sequence[ArrayLike], statistic: Callable[[np.ndarray], float] = iqm, level: float = 0.95
 ) -> tuple[float, float, float]:
     """Returns a statistic of all tasks' scores and its stratified bootstrap interval:
     `(value, lower, upper)`. The runs of each task are resampled by themselves.

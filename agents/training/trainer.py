@@ -1,25 +1,20 @@
 """The training loop: collect, update, report, save."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.ranks import Plan, Ranks, world
+from megastep.agents.networks.policy import Policy
 from megastep.agents.runs.saver import NOWHERE, Saver
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.callbacks import Callbacks, Losses, NonFiniteGuard, Tuning
 from megastep.agents.training.episode_stats import Episodes
 from megastep.agents.training.performance import Timing
 from megastep.agents.training.run_state import RunState
-from megastep.agents.types import LearnerOptions, with_defaults
+from megastep.agents.types import Learner, LearnerOptions, StateDict, with_defaults
 from megastep.types import Env, optional
-
-if TYPE_CHECKING:
-    from megastep.agents.networks.policy import Policy
-    from megastep.agents.types import Learner, StateDict
 
 
 class Trainer:

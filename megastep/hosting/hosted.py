@@ -195,11 +195,7 @@ class ParallelEnvs(Hosted):
     """N parallel environments of PettingZoo. `present`, (B,) bool: agents of the next step."""
 
     def __init__(
-        self,
-        make: Callable,
-        n_envs: int,
-        kwargs: dict[str, Any],
-        wrappers: Sequence[Callable] = (),
+        self, make: Callable, n_envs: int, kwargs: dict[str, Any], wrappers: Sequence[Callable] = ()
     ):
         parameters = inspect.signature(make).parameters
         if "render_mode" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):

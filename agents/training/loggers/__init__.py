@@ -10,14 +10,11 @@ says what it needs.
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megastep.agents.errors import shortened
 from megastep.agents.runs.json_lines import JsonLines, truncate_after
+from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import Logger, RunResult
-
-if TYPE_CHECKING:
-    from megastep.agents.training.trainer import Trainer
 
 
 class LoggerError(RuntimeError):
@@ -58,7 +55,7 @@ class Loggers:
             except Exception as error:
                 warnings.warn(f"logger={name} skipped: {shortened(error, 300)}", stacklevel=2)
 
-    def on_report(self, trainer: "Trainer", metrics: Mapping[str, float | str]) -> None:
+    def on_report(self, trainer: Trainer, metrics: Mapping[str, float | str]) -> None:
         """Writes a report."""
         self.write(trainer.samples, metrics)
 
