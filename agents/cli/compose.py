@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from types import NoneType
-from typing import Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import hydra
 import yaml
@@ -22,13 +22,15 @@ from omegaconf import Container, DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from megastep.agents import package
-from megastep.agents.cli.command import Command
 from megastep.agents.cli.words import Typed, key_of, parse, typed_of, typed_word
 from megastep.agents.errors import ConfigErrors, UserError, shortened
 from megastep.agents.factory import check, components, conflicts
 from megastep.agents.launch import gpu
 from megastep.imports import import_object, import_path
 from megastep.settings import closest
+
+if TYPE_CHECKING:
+    from megastep.agents.cli.command import Command
 
 #: Members of Hydra's own groups that come with the optional dependencies.
 EXTRAS = ("joblib", "optuna", "submitit_local", "submitit_slurm")
@@ -161,7 +163,7 @@ def is_import_path(value: object) -> bool:
 class Composer:
     """Composes and checks a command's settings, from a file `name`, and a `folder` beside ours."""
 
-    def __init__(self, command: Command, name: str | None = None, folder: str | None = None):
+    def __init__(self, command: "Command", name: str | None = None, folder: str | None = None):
         self.command, self.name, self.folder = command, name or command.name, folder
         if folder and not os.path.isdir(folder):
             raise UserError(f"There is no folder {folder} with configurations")
@@ -341,7 +343,7 @@ def store_member(group: str, member: str, path: str) -> None:
     STORE.store(group=group, name=member, node=node)
 
 
-def settings_from(command: Command, arguments: Mapping[str, Any]) -> Any:
+def settings_from(command: "Command", arguments: Mapping[str, Any]) -> Any:
     """Returns the checked settings of a command from keyword arguments."""
     state = global_hydra.GlobalHydra.instance()
     before = state.hydra  # of a program of the user's
