@@ -40,10 +40,6 @@ class _Optimizer:
             self.groups.setdefault(key, []).append(p)
 
     @torch.no_grad()
-    @fused(
-        lambda self: squared_norms(self).sum().sqrt(),
-        lambda self: isinstance(self, Adam) and has_kernels(self),
-    )
     def grad_norm(self) -> torch.Tensor:
         """Returns the norm () of all gradients together."""
         gradients = [p.grad for p in self.parameters if p.grad is not None]
@@ -200,7 +196,7 @@ def has_kernels(adam: Adam) -> bool:
 
 
 def squared_norms(adam: Adam) -> torch.Tensor:
-    """Returns (n,) numbers that add up to the square of `grad_norm`."""
+    """Returns (n,) numbers that add up to the square of the norm of all gradients."""
     launches = list(_launches(adam))
     sums, first_sum = adam.n_steps.new_empty(sum(n for _, n in launches)), 0
     for rows, n_blocks in launches:

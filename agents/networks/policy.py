@@ -220,23 +220,16 @@ class Policy(nn.Module):
     def _features(self, obs, reset, state, lanes=None) -> tuple[torch.Tensor, arrdict]:
         return cores.with_residual(self.core, self.intake(obs, lanes), reset, state)
 
-    def value(
-        self,
-        features: torch.Tensor,
-        privileged: Tree | None = None,
-        lanes: torch.Tensor | None = None,
-    ) -> torch.Tensor:
+    def value(self, features: torch.Tensor, privileged: Tree | None = None) -> torch.Tensor:
         """Returns the critic's value (...,) float32 of features (..., width) and, if it is
-        asymmetric, of privileged observations, or of their `lanes` (M,) int64.
+        asymmetric, of privileged observations.
         """
         if self.critic is None:
             raise ValueError("the policy has no critic; files of agents and snapshots have none")
         with self.compute_dtype():
-            return self.critic(features, self.critic.encode(privileged, lanes))
+            return self.critic(features, self.critic.encode(privileged))
 
-    def prediction_error(
-        self, features: torch.Tensor, privileged: Tree, lanes: torch.Tensor | None = None
-    ) -> torch.Tensor:
+    def prediction_error(self, features: torch.Tensor, privileged: Tree) -> torch.Tensor:
         """Returns the error (T, B) of predicting the encoded privileged observations from features:
         a mean squared error in standard deviations. Arguments are those of `value`.
 
@@ -245,7 +238,7 @@ class Policy(nn.Module):
         from megastep.agents.networks.critic import prediction_error
 
         with self.compute_dtype():
-            encoded = self.critic.intake.encode(privileged, lanes)
+            encoded = self.critic.encode(privileged)
             return prediction_error(self.prediction, features, encoded)
 
     def terms(

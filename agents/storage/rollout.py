@@ -34,13 +34,13 @@ class Rollout:
         state: the policy's hidden state of B lanes, such as `policy.initial(B)`; copied.
         device: device of all tensors.
         privileged_space: space of privileged observations, which only the critic sees, or None.
-        obs_dtype: dtype of observations, except integers and spaces that name a dtype.
         learners: bool per lane of the environment, true for the B lanes to store, in environments
             with opponents; None stores every lane.
         values: whether to store the critic's values.
 
     Attributes:
-        obs: (T+1, B, ...). The last row is the observation that the next rollout starts from.
+        obs: (T+1, B, ...), float16 unless integers or the space names a dtype. The last row is the
+            observation that the next rollout starts from.
         privileged: (T+1, B, ...) float32, or None without a `privileged_space`.
         mask: (T+1, B, A, n) bool per discrete action space, allowed actions, or None if worlds have
             none.
@@ -69,14 +69,13 @@ class Rollout:
         state: arrdict,
         device: torch.device | str | None = None,
         privileged_space: Space | None = None,
-        obs_dtype: torch.dtype = torch.float16,
         learners: torch.Tensor | None = None,
         values: bool = True,
     ):
         self.n_steps, self.n_lanes, self.learners = n_steps, n_lanes, learners
         self.lane_indices = None if learners is None else learners.nonzero()[:, 0]
         rows, with_last = (n_steps, n_lanes), (n_steps + 1, n_lanes)
-        self.obs = _zeros(obs_space, with_last, device, obs_dtype)
+        self.obs = _zeros(obs_space, with_last, device, torch.float16)
         self.privileged = None
         if privileged_space is not None:
             self.privileged = _zeros(privileged_space, with_last, device)

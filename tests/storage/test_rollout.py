@@ -66,13 +66,13 @@ class LabelledEnv:
         )
 
 
-def collected(n_rollouts=1, dtype=torch.float32, env=None, values=True):
+def collected(n_rollouts=1, env=None, values=True):
     """Collects some rollouts. Returns env, policy, the last rollout and the actor state."""
     env = env or LabelledEnv()
     policy = Policy(env.obs_space, env.action_space, width=16)
     state = policy.initial(B)
     env_spaces = env.obs_space, env.action_space
-    rollout = Rollout(T, B, *env_spaces, state, obs_dtype=dtype, values=values)
+    rollout = Rollout(T, B, *env_spaces, state, values=values)
     actor_state = initial_actor_state(env, policy, rollout)
     for _ in range(n_rollouts):
         actor_state = collect(env, policy, rollout, actor_state)
@@ -85,8 +85,8 @@ def test_rows_line_up_with_env(n_rollouts):
     first = (n_rollouts - 1) * T
     for row in range(T + 1):
         time = first + row
-        assert torch.equal(rollout.obs.eye[row, :, 0, 0, 0, 1], env.label(time))
-        assert torch.equal(rollout.obs.rest.imu[row, :, 0, 2], env.label(time) + 0.5)
+        assert torch.equal(rollout.obs.eye[row, :, 0, 0, 0, 1].float(), env.label(time))
+        assert torch.equal(rollout.obs.rest.imu[row, :, 0, 2].float(), env.label(time) + 0.5)
         assert torch.equal(
             rollout.starts[row], env.ends(time - 1) if time else torch.ones(B, dtype=torch.bool)
         )
@@ -138,7 +138,7 @@ def test_environments_of_megastep_leave_actions_as_they_are(name):
 
 
 def test_logprobs_and_values_match_unroll():
-    _, policy, rollout, actor_state = collected(n_rollouts=2, dtype=torch.float16)
+    _, policy, rollout, actor_state = collected(n_rollouts=2)
     out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
     close = dict(rtol=1e-4, atol=1e-4)  # sums of numbers up to 500 in another order
     torch.testing.assert_close(rollout.values, policy.value(out.features), **close)
@@ -175,7 +175,7 @@ def test_collector_continues_between_rollouts():
     addresses = [leaf.data_ptr() for leaf in leaves(rollout.state)]
     for _ in range(3):
         collector()
-    _, _, expected, _ = collected(n_rollouts=3, dtype=torch.float16)
+    _, _, expected, _ = collected(n_rollouts=3)
     assert torch.equal(rollout.values, expected.values) and collector.graph is None
     assert torch.equal(rollout.state.cell, expected.state.cell)
     assert [leaf.data_ptr() for leaf in leaves(rollout.state)] == addresses
