@@ -55,11 +55,11 @@ def _lines(path: Path) -> Iterator[str]:
 
 def _lines_of_agent(path: Path) -> Iterator[str]:
     """Yields the text about the file of an agent."""
-    loaded, about = agent_file.read(path, "cpu"), agent_file.read_metadata(path)
+    loaded = agent_file.read(path, "cpu")
     yield f"{path}: intact, {console.number(path.stat().st_size)} bytes"
-    yield from (f"  {name}: {value}" for name, value in about["facts"].items())
+    yield from (f"  {name}: {value}" for name, value in loaded.about["facts"].items())
     yield from _parts(loaded.state)
-    for table in about["tables"]:
+    for table in loaded.about["tables"]:
         yield f"  {table['title']}: {len(table['rows'])} rows"
 
 

@@ -110,7 +110,8 @@ class Step(nn.Module):
         state, reset = _filled(self.policy.initial(1), [*tensors[end + 1 :]]), tensors[end]
         obs = mapping(torch.unsqueeze)(_nested(dict(zip(paths, tensors[:n]))), 0)
         features, state = self.policy._features(obs, reset[None], state)
-        logits = output.masked(output(features[0]), mask)
+        logits = output(features[0])
+        logits = logits if mask is None else output.masked(logits, mask)
         return output.greedy(logits), logits, state
 
 

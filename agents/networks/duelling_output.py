@@ -146,9 +146,9 @@ class DuellingOutput(Output):
             advantage = self.advantage(advantage).unflatten(-1, self.shape)
         return value + advantage - advantage.mean(-1, keepdim=True)
 
-    def masked(self, logits: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+    def masked(self, logits: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """Returns values with which only allowed actions are the best."""
-        return logits if mask is None else logits.masked_fill(~mask, FORBIDDEN)
+        return logits.masked_fill(~mask, FORBIDDEN)
 
     def value_parameters(self) -> tuple[torch.Tensor, ...]:
         """Returns weight and bias of the value, then of the advantages."""

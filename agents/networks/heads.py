@@ -69,13 +69,13 @@ class Output(nn.Module):
             mask: allowed actions, as for `masked`. None: all.
             options: further arguments of `sample`.
         """
-        logits = self.masked(self(x), mask)
+        logits = self(x) if mask is None else self.masked(self(x), mask)
         actions = self.sample(logits, generator, **options) if sample else self.greedy(logits)
         return logits, actions, self.logprob(logits, actions)
 
-    def masked(self, logits: Tree, mask: Tree = None) -> Tree:
+    def masked(self, logits: Tree, mask: Tree) -> Tree:
         """Returns logits with which only actions that a mask (..., A, n) bool allows are chosen;
-        all, if it is None or actions are continuous.
+        all, if actions are continuous.
         """
         return logits
 
@@ -171,9 +171,9 @@ class MultiDiscreteOutput(Output):
         scores = linear(x, self.linear).float()
         return scores.unflatten(-1, self.shape).log_softmax(-1)
 
-    def masked(self, logits: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+    def masked(self, logits: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """Returns log-probabilities among the allowed actions."""
-        return logits if mask is None else logits.masked_fill(~mask, FORBIDDEN).log_softmax(-1)
+        return logits.masked_fill(~mask, FORBIDDEN).log_softmax(-1)
 
     def sample(
         self, logits: torch.Tensor, generator: torch.Generator | None = None
@@ -226,11 +226,11 @@ class DictOutput(Output):
     def forward(self, x: torch.Tensor) -> arrdict:
         return arrdict({key: output(x) for key, output in self.outputs.items()})
 
-    def masked(self, logits: Tree, mask: Tree = None) -> Tree:
+    def masked(self, logits: Tree, mask: Tree) -> arrdict:
         """Masks key by key."""
-        if mask is None:
-            return logits
-        return self._each("masked", logits, {key: mask.get(key) for key in logits})
+        outputs = typing.cast("Mapping[str, Output]", self.outputs)
+        keys = [key for key in logits if mask.get(key) is not None]
+        return arrdict(logits, **{key: outputs[key].masked(logits[key], mask[key]) for key in keys})
 
     def sample(
         self, logits: Tree, generator: torch.Generator | None = None, **options: torch.Tensor

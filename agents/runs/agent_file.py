@@ -84,32 +84,29 @@ def sealed(content: bytes) -> bytes:
 
 
 def read(path: Path, device: torch.device | str | None) -> Checkpoint:
-    """Loads an agent file as a checkpoint of a policy; without a device, no state."""
-    metadata, state = read_metadata(path), None
-    if device is not None:
-        from safetensors.torch import load_file
-
-        tensors = load_file(path, str(device))
-        state = {"policy": tensors, "wrappers": metadata["wrappers"]}
-    return Checkpoint(path, metadata["facts"]["samples"], {}, metadata["config"], {}, state)
-
-
-def read_metadata(path: Path) -> Row:
-    """Returns `config`, `facts`, `tables` and `wrappers` of an agent file. Raises as `read`."""
+    """Loads an agent file as a checkpoint that has only the policy's state, on a device; without
+    one no state. Raises CheckpointError if it is damaged or of another version.
+    """
     try:
         with safetensors.safe_open(path, framework="np") as file:
             texts = {"wrappers": "{}", **(file.metadata() or {})}
-        if (version := texts.get("format")) == FORMAT:
-            if (content := path.read_bytes()) != sealed(content):
-                raise ValueError("its bytes do not match their SHA-256")
-            return {name: typed_json.loads(texts[name], kind) for name, kind in KINDS.items()}
+        if (version := texts.get("format")) != FORMAT:
+            raise CheckpointError(
+                f"{path} has format {shortened(repr(version), 20)}, and this version of megastep "
+                f"reads {FORMAT}; export the agent again"
+            )
+        if (content := path.read_bytes()) != sealed(content):
+            raise ValueError("its bytes do not match their SHA-256")
+        about = {name: typed_json.loads(texts[name], kind) for name, kind in KINDS.items()}
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({shortened(error)})") from None
     except (safetensors.SafetensorError, ValueError, KeyError) as error:
         raise CheckpointError(
             f"{path} is damaged or not an agent file of megastep: {shortened(error)}"
         ) from None
-    raise CheckpointError(
-        f"{path} has format {shortened(repr(version), 20)}, and this version of megastep reads "
-        f"{FORMAT}; export the agent again"
-    )
+    state = None
+    if device is not None:
+        from safetensors.torch import load_file
+
+        state = {"policy": load_file(path, str(device)), "wrappers": about["wrappers"]}
+    return Checkpoint(path, about["facts"]["samples"], {}, about["config"], {}, state, about=about)

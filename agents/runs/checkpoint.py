@@ -77,6 +77,7 @@ class Checkpoint:
     made_with: Row  # versions, device and threads that the numbers depend on
     state: StateDict | None = None  # None if it was not loaded
     n_ranks: int = 1  # whose state it holds
+    about: Row = dataclasses.field(default_factory=dict)  # `facts` and `tables` of an agent file
 
 
 # ---- Writing ----

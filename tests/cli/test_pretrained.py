@@ -88,7 +88,7 @@ def test_weights_are_float16_and_statistics_float32(file):
 
 
 def test_file_has_the_results_of_the_run(file, exported):
-    tables = agent_file.read_metadata(file)["tables"]
+    tables = agent_file.read(file, None).about["tables"]
     written = json.loads(next((exported / "run/evaluations").glob("suite-*.json")).read_text())
     assert tables[0]["rows"][0]["return"] == written["rows"][0]["return"]
     assert tables[0]["command"] == f"geometry=suite '{PARTS}' split=test episodes=8 seed=1"
@@ -265,7 +265,7 @@ def test_every_flipped_bit_of_a_header_is_found(tmp_path):
 
 def test_modules_of_others_need_trust(file, capsys):
     content = file.read_bytes()
-    config = agent_file.read_metadata(file)["config"]
+    config = agent_file.read(file, None).config
     config["train"]["agent"]["core"] = "planted:Core"
     file.write_bytes(changed(content, config=json.dumps(config)))
     assert evaluate.main([f"run={NAME}"]) == 2
@@ -297,8 +297,9 @@ def test_agent_of_the_package(path):
     """It loads, acts, is small, and has a card."""
     assert path.stat().st_size <= 4_000_000
     assert trust.foreign_names(agent_file.read(path, None).config) == []
-    assert agent_file.read_metadata(path)["tables"], "evaluated in the suite"
-    card, facts = path.with_suffix(".md").read_text(), agent_file.read_metadata(path)["facts"]
+    about = agent_file.read(path, None).about
+    assert about["tables"], "evaluated in the suite"
+    card, facts = path.with_suffix(".md").read_text(), about["facts"]
     assert f"- samples: {facts['samples']:,}\n" in card and facts["commit"] in card
     env = env_of(path.stem, geometries.sample("homes", 2), n_envs=2)
     policy = pretrained.load(path.stem, "cpu")
