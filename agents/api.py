@@ -234,9 +234,10 @@ def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
         env: from `make`, in which it acts. Its settings are kept, and what wrappers have learnt.
         file: NAME.safetensors.
     """
+    from megastep import spaces
     from megastep.agents.export import agent  # with PyTorch
     from megastep.agents.networks.policy import Policy
-    from megastep.agents.runs import agent_file, checkpoint, restore, trust
+    from megastep.agents.runs import agent_file, checkpoint, trust
 
     if type(policy) is not Policy:
         raise UserError(
@@ -253,7 +254,7 @@ def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
     of_env, geometry, seed = made
     train = dict(env=check.as_tree(of_env), geometry=check.as_tree(geometry), seed=seed)
     train |= dict(agent=_plain(policy.settings, "agent"), learner={"name": "unknown"})
-    config = {"train": train, "spaces": restore.spaces_of(policy)}
+    config = {"train": train, "spaces": spaces.texts(policy)}
     state = {"policy": policy.state_dict(), "wrappers": optional(env, "wrapper_state")()}
     loaded = checkpoint.Checkpoint(Path("The policy"), 0, {}, config, {}, state)
     agent.write_loaded(loaded, path, {"samples": 0}, env=env)

@@ -178,6 +178,12 @@ def from_text(text: str) -> _Space:
         raise ValueError(f"{text!r} is not a space: {error}") from None
 
 
+def texts(env: Any) -> dict[str, str]:
+    """Returns the spaces of an environment or a policy: {'obs.rgb': 'MultiImage(...)', ...}."""
+    tree = {"obs": env.obs_space, "actions": env.action_space}
+    return {name: repr(space) for name, space in leaves(tree).items()}
+
+
 def random_actions(
     space: object,
     n_lanes: int,
@@ -225,6 +231,20 @@ def leaves(space: object, name: str = "") -> dict[str, Any]:
     for key, child in space.items():
         paths |= leaves(child, f"{name}.{key}" if name else key)
     return paths
+
+
+def nested(leaves: Mapping[str, Any]) -> Any:
+    """Returns the tree of leaves by dotted path: the inverse of :func:`leaves`."""
+    if "" in leaves:
+        return leaves[""]
+    tree = arrdict()
+    for path, leaf in leaves.items():
+        *keys, last = path.split(".")
+        branch = tree
+        for key in keys:
+            branch = branch.setdefault(key, arrdict())
+        branch[last] = leaf
+    return tree
 
 
 def map(function: Callable, space: object, *trees: Any) -> Any:

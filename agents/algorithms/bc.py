@@ -72,9 +72,7 @@ class BC(learner.GradientLearner):
 
     def collector(self, env: Env, values: bool = False) -> CollectorLike:
         """Returns a collector of the dataset's episodes. ValueError names a space that differs."""
-        tree = {"obs": env.obs_space, "actions": env.action_space}
-        own = {name: repr(space) for name, space in spaces.leaves(tree).items()}
-        stored = self.dataset.about["spaces"]
+        own, stored = spaces.texts(env), self.dataset.about["spaces"]
         for name in {**own, **stored}:
             if own.get(name) != stored.get(name):
                 raise ValueError(

@@ -180,7 +180,7 @@ class Waves:
         is_drawn = getattr(env, "resample", False)
         self.homes = homes if is_drawn else factory.spread(homes, n_envs)
         with factory.errors():
-            self.codec = episodes.Codec(restore.spaces_of(self.sample))
+            self.codec = episodes.Codec(spaces.texts(self.sample))
         self.n_lanes, self.n_agents = n_envs * n_agents, n_agents
         self.most = cfg.max_steps or optional(self.sample, "max_episode_steps")
 

@@ -106,9 +106,9 @@ class Step(nn.Module):
         """Returns actions, logits and the next hidden state."""
         paths, output = self.policy.intake.paths, self.policy.output
         n, end = len(paths), len(paths) + len(self.masks)
-        mask = _nested(dict(zip(self.masks, tensors[n:end]))) if self.masks else None
+        mask = spaces.nested(dict(zip(self.masks, tensors[n:end]))) if self.masks else None
         state, reset = _filled(self.policy.initial(1), [*tensors[end + 1 :]]), tensors[end]
-        obs = mapping(torch.unsqueeze)(_nested(dict(zip(paths, tensors[:n]))), 0)
+        obs = mapping(torch.unsqueeze)(spaces.nested(dict(zip(paths, tensors[:n]))), 0)
         features, state = self.policy._features(obs, reset[None], state)
         logits = output(features[0])
         logits = logits if mask is None else output.masked(logits, mask)
@@ -127,20 +127,6 @@ def _ports(tensors, paths_by_kind) -> list[Port]:
 
 def _filled(tree, values) -> arrdict:
     return tree.map(lambda leaf: values.pop(0)) if tree else tree
-
-
-def _nested(flat) -> Tree:
-    """Returns the tree of leaves by dotted path."""
-    if [*flat] == [""]:
-        return flat[""]
-    tree: dict = {}
-    for path, leaf in flat.items():
-        *groups, name = path.split(".")
-        node = tree
-        for group in groups:
-            node = node.setdefault(group, {})
-        node[name] = leaf
-    return tree
 
 
 # ---- Files ----

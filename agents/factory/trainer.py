@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 import torch
 
-from megastep import scene
+from megastep import scene, spaces
 from megastep.agents import console
 from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import UserError, memory_problem, shortened
@@ -83,7 +83,7 @@ def make_trainer(
     if resumed and number == 0:
         for name in "checkpoints", "snapshots":
             checkpoint.set_aside_after(folder / name, resumed.step)
-    config = {"train": check.as_tree(cfg), "spaces": restore.spaces_of(env)}
+    config = {"train": check.as_tree(cfg), "spaces": spaces.texts(env)}
     made_with = provenance.made_with(device, n_ranks)
     with factory.errors():
         of_ranks = cfg.checkpoints.replay_every, token, number, n_ranks

@@ -27,13 +27,8 @@ def policy_of(
     settings = loaded.config["train"]["agent"]
     kinds = (ValueError, TypeError, KeyError, RuntimeError)
     with user_errors(f"{loaded.path} cannot be used: ", kinds):
-        tree: dict = {}
-        for name, text in loaded.config["spaces"].items():
-            *keys, last = name.split(".")
-            branch = tree
-            for key in keys:
-                branch = branch.setdefault(key, {})
-            branch[last] = spaces.from_text(text)
+        texts = loaded.config["spaces"]
+        tree = spaces.nested({name: spaces.from_text(text) for name, text in texts.items()})
         if device.type == "cpu":
             share_threads(settings["width"])
         seen = tree["obs"], tree["actions"], optional(env, "privileged_space") if env else None
@@ -43,7 +38,7 @@ def policy_of(
 
 def load_weights(policy: Policy, loaded: "Checkpoint", env: Env | None = None) -> Policy:
     """Returns a policy with a checkpoint's weights. UserError if weights or spaces do not fit."""
-    saved, present = loaded.config["spaces"], {} if env is None else spaces_of(env)
+    saved, present = loaded.config["spaces"], {} if env is None else spaces.texts(env)
     if present and (names := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]):
         changes = [f"{name} was {saved.get(name)} and is {present.get(name)}" for name in names]
         ids = loaded.config["train"]["env"].get("id"), getattr(env, "id", None)
@@ -73,9 +68,3 @@ def load_wrappers(env: Env, loaded: "Checkpoint", is_frozen: bool = True) -> Non
             if load is None:
                 raise ValueError(f"{type(env).__name__} has no load_wrapper_state")
             load(state, is_frozen)
-
-
-def spaces_of(env: Env | Policy) -> dict[str, str]:
-    """Returns the spaces of an environment or policy: {'obs.rgb': 'MultiImage(...)', ...}."""
-    tree = {"obs": env.obs_space, "actions": env.action_space}
-    return {name: repr(space) for name, space in spaces.leaves(tree).items()}

@@ -57,7 +57,7 @@ class DatasetCollector:
         if masks:
             shape = rollout.n_steps + 1, rollout.n_lanes
             zeros = {k: v.new_ones(*shape, *_mask_shape(v[0])) for k, v in masks.items()}
-            rollout.mask = episodes.nested(zeros)["mask"]
+            rollout.mask = spaces.nested(zeros)["mask"]
 
     @torch.no_grad()
     def __call__(self) -> Rollout:

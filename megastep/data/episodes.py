@@ -113,19 +113,7 @@ class Codec:
         leaves = {path: self.decode(path, left.pop(name)) for path, name in self.names.items()}
         leaves = {k: leaf[1:] if k.startswith("actions") else leaf for k, leaf in leaves.items()}
         outcomes = {name: left.pop(name)[1:] for name in OUTCOMES}
-        return arrdict(nested(leaves), **outcomes, **left)
-
-
-def nested(leaves: Mapping[str, Any]) -> arrdict:
-    """Returns the tree of leaves by dotted path: the inverse of `spaces.leaves`."""
-    tree = arrdict()
-    for path, leaf in leaves.items():
-        *keys, last = path.split(".")
-        branch = tree
-        for key in keys:
-            branch = branch.setdefault(key, arrdict())
-        branch[last] = leaf
-    return tree
+        return arrdict(spaces.nested(leaves), **outcomes, **left)
 
 
 # ---- Files ----
