@@ -16,6 +16,9 @@ import filelock
 import pytest
 import torch
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import ConfigRepository
+from hydra.core.config_store import ConfigStore
+from hydra.core.object_type import ObjectType
 from hydra.core.utils import JobRuntime
 
 from megastep import cache
@@ -101,36 +104,47 @@ def trainers(monkeypatch):
 
 @pytest.fixture(scope="session", autouse=True)
 def composed_once():
-    """Has Hydra compose the same words, and list a group's files, once per session.
+    """Has Hydra compose the same words, list a group's files and read a file once per session.
 
     Each takes a tenth of a second or more, and tests repeat the same few. Folders other than
     configs/ are read anew.
     """
     load, list_options = ConfigLoaderImpl.load_configuration, ConfigLoaderImpl.get_group_options
-    cached = {}
+    read, cached = ConfigRepository.load_config, {}
+
+    def copied(key, method, *arguments, **options):
+        key = str((key, compose.BlockSource.blocks))
+        if key not in cached:
+            cached[key] = pickle.dumps(method(*arguments, **options))
+        return pickle.loads(cached[key])  # in a tenth of the time of copy.deepcopy
 
     def once(loader, method, *arguments, **options):
         paths = [entry.path for entry in loader.get_search_path().get_path()]
         folders = [path for path in paths if not path.startswith(("pkg://", "structured://"))]
-        name = JobRuntime.instance().get("name")
-        key = str((method, name, arguments, options, compose.BlockSource.blocks))
-        is_ours = folders == [f"blocks://{package.CONFIGS}"]
-        if not is_ours:
+        if folders != [f"blocks://{package.CONFIGS}"]:
             return method(loader, *arguments, **options)
-        if key not in cached:
-            cached[key] = pickle.dumps(method(loader, *arguments, **options))
-        return pickle.loads(cached[key])  # in a tenth of the time of copy.deepcopy
+        key = method, JobRuntime.instance().get("name"), arguments, options
+        return copied(key, method, loader, *arguments, **options)
 
     def load_once(loader, *arguments, **options):
         config = once(loader, load, *arguments, **options)
         config.hydra.runtime.cwd = os.getcwd()
         return config
 
+    def read_once(repository, config_path):
+        source = repository._find_object_source(config_path, ObjectType.CONFIG)
+        if source is None or source.path not in (str(package.CONFIGS), "hydra.conf"):
+            return read(repository, config_path)
+        return copied((source.path, config_path), read, repository, config_path)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigLoaderImpl, "load_configuration", load_once)
         patch.setattr(
             ConfigLoaderImpl, "get_group_options", functools.partialmethod(once, list_options)
         )
+        patch.setattr(ConfigRepository, "load_config", read_once)
+        # Hydra copies all that is stored whenever it composes, and only reads it
+        patch.setattr(ConfigStore, "__deepcopy__", lambda store, memo: store, raising=False)
         yield
 
 
