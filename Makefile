@@ -74,16 +74,20 @@ setup: $(SETUP)            ## create .venv
 # packages are built from source, without isolation: with the setuptools whose hash is checked.
 # pip would compile 17,000 files, one after the other: what is used is compiled when it is imported.
 INSTALL = .venv/bin/python -m pip install --no-compile
+HASHED = $(INSTALL) --no-deps --require-hashes --no-build-isolation
+TORCH = $(INSTALL) -c constraints.txt torch==2.13.0
+# pip mostly waits for the package index, so two of them install different packages.
 LOCKED = $(BASE) -c 'import sys; sys.exit(sys.version_info >= (3, 14))' \
-	&& $(INSTALL) --no-deps --require-hashes -r requirements/build.txt \
-	&& $(INSTALL) --no-deps --require-hashes --no-build-isolation -r requirements/packages.txt -r requirements/test.txt
+	&& $(HASHED) -r requirements/build.txt \
+	&& { $(HASHED) -q -r requirements/test.txt & \
+		$(HASHED) -r requirements/packages.txt && $(TORCH); run=$$?; wait $$! && test $$run = 0; }
 
 .venv/stamp: pyproject.toml constraints.txt $(wildcard requirements/*.txt)
 	@$(BASE) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { echo "megastep needs Python 3.10 or newer. Choose one with: make BASE=python3.12"; exit 1; }
 	@$(BASE) -c 'import ensurepip' 2>/dev/null || { echo "This Python cannot create virtual environments. On Debian: apt install python3-venv"; exit 1; }
 	$(BASE) -m venv .venv
 	{ $(LOCKED); } || { echo "The versions in requirements/ cannot be installed here; taking the newest that fit."; $(INSTALL) setuptools; }
-	$(INSTALL) -c constraints.txt torch==2.13.0
+	$(TORCH)
 	$(INSTALL) -c constraints.txt --no-build-isolation -e '.[test]'
 	PYTHONDONTWRITEBYTECODE= .venv/bin/python -c "import megastep.agents.cli.train, megastep.agents.cli.record"
 	touch .venv/stamp
