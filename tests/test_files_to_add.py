@@ -162,5 +162,5 @@ def test_one_of_each_is_added_to_a_copy(tmp_path):
     assert (train["env"]["limit"], train["learner"]["patience"]) == (4, 2)
     assert (tmp_path / "run" / "memo.txt").read_text().startswith("said ")
     # tests over what exists take what is new
-    of_all = "every_group_member or loggers or help_lists"
+    of_all = "every_group_member and (learner or logger) or loggers or help_lists"
     run("-m", "pytest", "-q", "-n", "0", "-m", "", "-k", of_all, "tests/cli/test_config.py")

@@ -28,6 +28,7 @@ LONG |= {
     "sweeps.md",
     "training.md",
     "waypoint.md",
+    "web-page.md",
 }
 BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\S*)[^\n]*\n(.*?)```", re.S)
 FILE = re.compile(r"(?:#|//|<!--) (\S+\.(?:py|h|cpp|cu|svg))(?: -->)?\n")

@@ -219,8 +219,10 @@ def test_learns_bandit(name):
     assert rewards / ends > 0.9
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["ppo", "r2d2"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("ppo", marks=pytest.mark.nightly), pytest.param("r2d2", marks=pytest.mark.slow)],
+)
 def test_learns_corridor(name):
     """The shortest way takes 6 steps. A random policy arrives in a third of the episodes. R2D2
     takes some random actions while it learns.
@@ -244,7 +246,7 @@ def test_remembers_cue(name):
         ("ppo", "gaussian"),
         ("ppo", "beta"),
         pytest.param("vtrace", "beta", marks=pytest.mark.nightly),
-        pytest.param("vtrace-replay", "gaussian", marks=pytest.mark.slow),
+        pytest.param("vtrace-replay", "gaussian", marks=pytest.mark.nightly),
     ],
 )
 def test_learns_to_reach(name, continuous):

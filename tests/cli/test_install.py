@@ -14,7 +14,6 @@ import zipfile
 from pathlib import Path
 
 import pytest
-import yaml
 
 from tests.helpers import tiny
 
@@ -148,28 +147,24 @@ def test_sdist_builds_the_same_wheel(wheel, source, tmp_path):
 # ---- Installed ----
 
 
-def commands(python, folder, cache):
+def commands(python, folder):
     """Returns a function that runs the command `megastep` in a folder, and returns its output."""
     folder.mkdir()
 
     def megastep(*arguments, returncode=0):
         command = [python.with_name("megastep"), *arguments]
-        return run(command, folder, returncode, MEGASTEP_CACHE=str(cache))
+        return run(command, folder, returncode)
 
     return megastep
 
 
 @pytest.mark.slow
 def test_installed_command_trains_evaluates_and_records(installed, tmp_path):
-    megastep = commands(installed, tmp_path / "empty", tmp_path / "cache")
+    megastep = commands(installed, tmp_path / "empty")
     finish = ["finish.evaluate=true", "finish.episodes=4", "finish.record=true", "finish.steps=3"]
     output = megastep("train", *tiny.TINY, "samples=64", "folder=run", *finish)
     assert "trained" in output and "Traceback" not in output
     assert (tmp_path / "empty/run/video.mp4").exists()
-    errors = megastep("train", "lr=1", returncode=2)
-    assert "lr" in errors and "learner.lr" in errors
-    config = yaml.safe_load(megastep("train", "--cfg", "job", "env=pong"))
-    assert config["env"]["name"] == "megastep.envs.pong:Pong"
     assert re.match(r"megastep-flatland \d", megastep("--version"))
 
 
@@ -192,7 +187,7 @@ print(agents.Agent.__module__, agents.__file__, megastep.agents.__file__)
 
 @pytest.mark.nightly
 def test_sweeps_without_the_extra_packages(python, tmp_path):
-    megastep = commands(python, tmp_path / "empty", tmp_path / "cache")
+    megastep = commands(python, tmp_path / "empty")
     sweep = ["-m", "seed=1,2", "samples=64", "hydra.sweep.dir=mine"]
     assert "sweep.md" in megastep("train", *tiny.TINY, *sweep)
     error = megastep("train", "hydra/launcher=joblib", "-m", returncode=2)

@@ -83,7 +83,9 @@ def main(kernels):
         if kernels == "cuda-on-cpu":
             CudaOnCpu().install(patch)
         for name in ENVS:
-            attack(name, "cuda" if kernels == "cuda" else "cpu", VALUES)
+            # each night, and on a GPU, also what is in memory
+            values = VALUES[:2] if kernels == "cpu" else VALUES
+            attack(name, "cuda" if kernels == "cuda" else "cpu", values)
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def same_bits(ours, theirs):
 def test_cuda_kernels_on_a_cpu_agree_on_every_bit(source, cuda_on_cpu, monkeypatch):
     expected = trajectory("cpu", source)
     cuda_on_cpu.install(monkeypatch)
-    for order in ORDERS:
+    for order in ORDERS[1:]:  # tests/envs run the first, which is the CPU's own
         monkeypatch.setattr(cuda_on_cpu, "order", order)
         same_bits(expected, trajectory("cpu", source))
     assert "physics_bodies" in cuda_on_cpu.launched

@@ -113,7 +113,7 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu,
     expected = trajectory("cpu", n_steps=2, **settings)
     cuda_on_cpu.install(monkeypatch)
     pretend(monkeypatch, amount, settings["n_agents"])
-    for order in ORDERS:
+    for order in ORDERS[1:]:  # tests/envs run the first, which is the CPU's own
         monkeypatch.setattr(cuda_on_cpu, "order", order)
         assert not any(differing(expected, trajectory("cpu", n_steps=2, **settings)))
     can_split = settings["res"] > 32 and 32 % settings.get("subsample", 1) == 0

@@ -194,7 +194,7 @@ def test_seaquest_with_things_that_are_equal_equals_the_original():
 @pytest.mark.slow
 @pytest.mark.parametrize("game", ["asterix", "seaquest", "space_invaders"])
 def test_equals_the_original_when_played_well(game):
-    play(game, n_envs=8, n_episodes=1, seed=3, n_plans=2, limit=400)
+    play(game, n_envs=4, n_episodes=1, seed=3, n_plans=2, limit=400)
 
 
 @pytest.mark.nightly

@@ -15,6 +15,7 @@ import check_kernels
 import pytest
 import torch
 
+from megastep import cache
 from megastep.agents.storage.copies import LIBRARY as COPIES
 from megastep.kernels.build import compile, kernel_library, launch
 from megastep.kernels.build.launch import ENGINE
@@ -116,10 +117,17 @@ def test_a_failing_compiler_is_quoted(tmp_path, monkeypatch):
 @pytest.mark.slow
 @libraries
 @pytest.mark.skipif(shutil.which("objdump") is None, reason="needs objdump")
-def test_no_fused_multiply_adds(kernels, tmp_path):
+def test_no_fused_multiply_adds(kernels, tmp_path, monkeypatch):
     """They round once instead of twice, so the CPU's bits would differ from the GPU's."""
-    library = tmp_path / "engine.so"
-    library.write_bytes(compile._build_cpu(kernels, compile.compiler()[0]))
+    library, fetch = tmp_path / "engine.so", cache.fetch
+
+    def noted(name, build):
+        content, path = fetch(name, build)
+        library.write_bytes(content)
+        return content, path
+
+    monkeypatch.setattr(cache, "fetch", noted)
+    compile.cpu.__wrapped__(kernels)
     code = subprocess.run(
         ["objdump", "-d", str(library)], capture_output=True, text=True, check=True
     ).stdout

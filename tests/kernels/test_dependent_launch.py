@@ -86,9 +86,7 @@ def test_only_a_wait_as_the_first_statement_counts(relays, body):
 
 
 def ptx(library):
-    """The PTX of a library, {kernel: text}, once NVRTC has made a cubin too. Skips if there is no
-    NVRTC, which needs no GPU.
-    """
+    """The PTX of a library, {kernel: text}. Skips if there is no NVRTC, which needs no GPU."""
     nvrtc = pytest.importorskip("cuda.bindings.nvrtc")
     try:
         nvrtc.nvrtcVersion()
@@ -100,7 +98,7 @@ def ptx(library):
         compile.joined(files).encode(), b"kernels.cu", len(files), texts, names
     )
     handle = compile.check_status(made, "NVRTC")
-    flags = [*library.cuda_flags, "--gpu-architecture=sm_90"]
+    flags = [*library.cuda_flags, "--gpu-architecture=compute_90"]
     result = nvrtc.nvrtcCompileProgram(handle, len(flags), [flag.encode() for flag in flags])
     compile.check_status(result, "NVRTC")
     text = bytearray(compile.check_status(nvrtc.nvrtcGetPTXSize(handle), "NVRTC"))

@@ -8,41 +8,15 @@ import subprocess
 import sys
 
 import pytest
-from test_compile import ROOT, STEP, run
 
 from megastep import cache
+from megastep.envs.pong import LIBRARY as PONG
+from megastep.kernels.build import compile
+from tests.helpers.pages import ROOT
 
 UNUSED = "the cache is not used"
 BODY = b"what was built " * 10_000
 root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    """The file that a first use of the kernels puts in the cache, that use's output, and CXX."""
-    folder, compiler = tmp_path_factory.mktemp("cache"), tmp_path_factory.mktemp("fast") / "c++"
-    compiler.write_text('#!/bin/sh\nexec c++ "$@" -O0\n')
-    compiler.chmod(0o755)
-    status, out, err = run(STEP, folder, CXX=str(compiler))
-    assert status == 0 and UNUSED not in err, err
-    (path,) = folder.iterdir()
-    return path, out, str(compiler)
-
-
-@pytest.fixture(scope="module")
-def quick(built, tmp_path_factory):
-    """A path for CXX: a compiler that returns the library built before, after one second, or once
-    there is a file $MARKER.go.
-    """
-    path = tmp_path_factory.mktemp("compiler") / "c++"
-    path.write_text(
-        '#!/bin/sh\n[ "$1" = --version ] && exec echo quick\n'
-        'if [ "$MARKER" ]; then touch "$MARKER"; for i in $(seq 9999); do '
-        '[ -e "$MARKER.go" ] && break; sleep 0.05; done; else sleep 1; fi\n'
-        f'for out; do :; done\ncp {built[0]} "$out"\n'
-    )
-    path.chmod(0o755)
-    return str(path)
 
 
 @pytest.fixture
@@ -74,10 +48,13 @@ def mounted(folder, options):
 # ---- Reused, damaged, raced ----
 
 
-def test_library_is_cached(built):
-    path, out, compiler = built
+def test_library_is_cached(tmp_path, monkeypatch):
+    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
+    operations = compile.cpu.__wrapped__(PONG)
+    (path,) = tmp_path.iterdir()
     before = path.stat().st_mtime_ns
-    assert run(STEP, path.parent, CXX=compiler)[:2] == (0, out)
+    monkeypatch.setattr(compile, "_build_cpu", None)
+    assert compile.cpu.__wrapped__(PONG).keys() == operations.keys() == {"pong_step"}
     assert path.stat().st_mtime_ns == before
 
 
@@ -108,27 +85,40 @@ def test_damaged_file_is_built_again(fetch, damage, tmp_path):
     assert fetch(tmp_path) == (BODY, path, 0)
 
 
-@pytest.mark.slow
-def test_two_processes_build_at_once(built, quick, tmp_path):
-    env = {**os.environ, "MEGASTEP_CACHE": str(tmp_path), "CXX": quick}
-    command = [sys.executable, "-c", STEP]
+#: Builds for as long as the other process needs to build, too.
+BUILDS = """
+import pathlib, sys, time
+from megastep import cache
+def build():
+    pathlib.Path(sys.argv[1], sys.argv[2]).touch()
+    while len([*pathlib.Path(sys.argv[1]).iterdir()]) < 2:
+        time.sleep(0.01)
+    return b"x" * 1_000_000
+print(len(cache.fetch("name", build)[0]))
+"""
+
+
+def test_two_processes_build_at_once(tmp_path):
+    (started := tmp_path / "started").mkdir()
+    env = {**os.environ, "MEGASTEP_CACHE": str(tmp_path / "cache")}
+    command = [sys.executable, "-c", BUILDS, str(started)]
     both = [
-        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=env)
-        for _ in range(2)
+        subprocess.Popen([*command, name], stdout=subprocess.PIPE, text=True, cwd=ROOT, env=env)
+        for name in "ab"
     ]
-    assert [process.communicate()[0].strip() for process in both] == [built[1]] * 2
-    assert len(list(tmp_path.iterdir())) == 1, "no temporary file is left"
+    assert [process.communicate(timeout=100)[0].strip() for process in both] == ["1000000"] * 2
+    assert len(list((tmp_path / "cache").iterdir())) == 1, "no temporary file is left"
 
 
 # ---- Folders that cannot be used ----
 
 
-@pytest.mark.slow
-def test_noexec_folder(built, quick, tmp_path):
+def test_noexec_folder(tmp_path):
+    body = compile._build_cpu(PONG, compile.compiler()[0])
     with mounted(tmp_path / "noexec", "size=4m,noexec") as folder:
-        status, out, err = run(STEP, folder, CXX=quick)
-        assert (status, out) == (0, built[1]), err
-        assert err.count(UNUSED) == 1 and "no library can be loaded" in err
+        (folder / "kernels.so").write_bytes(body)
+        with pytest.warns(UserWarning, match=f"{UNUSED}.*no library can be loaded"):
+            assert compile._load("kernels.so", body, folder / "kernels.so").pong_step
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o702])

@@ -154,7 +154,7 @@ def variants(folder):
 
 
 @pytest.mark.parametrize(
-    "every", [pytest.param(50, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)]
+    "every", [pytest.param(100, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)]
 )
 @pytest.mark.parametrize("name", COMMANDS)
 def test_no_string_of_a_population_is_imported(here, name, every, capsys):

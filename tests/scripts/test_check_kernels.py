@@ -20,8 +20,14 @@ def test_finds_every_folder_with_cuda_kernels():
     assert folders == {file.resolve().parent for file in files}
 
 
+@pytest.mark.nightly
+def test_all_kernels_fit_on_a_gpu():
+    """tests/kernels/test_dependent_launch.py compiles all as far as PTX for each change."""
+    pytest.importorskip("cuda.bindings.nvrtc")
+    assert check_kernels.main([]) == 0
+
+
 def test_names_what_does_not_compile(tmp_path, monkeypatch, capsys):
-    """All of ours are compiled by tests/kernels/test_dependent_launch.py."""
     bindings = pytest.importorskip("cuda.bindings.nvrtc")
     try:
         bindings.nvrtcVersion()
