@@ -4,7 +4,7 @@ T steps of a rollout, B lanes, L steps of a sequence, M sequences of a minibatch
 valid steps: those that the environment took, of lanes that learn. An update never synchronises.
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, cast
 
 import torch
 from pydantic import Field
@@ -25,7 +25,7 @@ from megastep.agents.storage.replay import (
     defaults_from,
     replay_size,
 )
-from megastep.agents.storage.rollout import make_rollout, without_last
+from megastep.agents.storage.rollout import copy_tree, make_rollout, without_last
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
 from megastep.coefficients import on_device
@@ -340,22 +340,21 @@ class R2D2(learner.GradientLearner):
             result = result._replace(loss=result.loss + extra, metrics=result.metrics | own)
         return result
 
+    def _own(self) -> StateDict:
+        return dict(
+            target=self.target.state_dict(), n_taken=self.n_taken, reward_scale=self.reward_scale
+        )
+
     def copy_from(self, other: learner.GradientLearner) -> None:
         """Takes over what another learner has learnt, its target network too. In place."""
         super().copy_from(other)
-        assert isinstance(other, R2D2)
-        self.target.load_state_dict(other.target.state_dict())
-        self.n_taken.copy_(other.n_taken)
-        self.reward_scale.copy_(other.reward_scale)
+        copy_tree(self._own(), cast(R2D2, other)._own())
 
     def state_dict(self) -> StateDict:
         """Returns the base's state, the target network and what an update counts."""
-        own = dict(n_taken=self.n_taken.clone(), reward_scale=self.reward_scale.clone())
-        return dict(super().state_dict(), target=self.target.state_dict(), **own)
+        return dict(super().state_dict(), **mapping(torch.clone)(self._own()))
 
     def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`."""
         super().load_state_dict(state)
-        self.target.load_state_dict(state["target"])
-        self.n_taken.copy_(state["n_taken"])
-        self.reward_scale.copy_(state["reward_scale"])
+        copy_tree(self._own(), state)

@@ -133,9 +133,7 @@ def recurrence(by_kernel, *inputs):
     return lstm_module.lstm_sequence(*inputs)
 
 
-def sequence(
-    by_kernel, device, dtype, x, reset, state, weights, d_outputs, d_cell, is_residual=False
-):
+def sequence(by_kernel, device, dtype, x, reset, state, weights, d_outputs, d_cell, residual=False):
     """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU.
 
     Args:
@@ -143,10 +141,9 @@ def sequence(
     """
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
-    inputs = *to, reset.to(device), *states, is_residual
     with plain_operations():
-        outputs, last, cell = recurrence(by_kernel, *inputs)
-    assert is_residual or torch.equal(last, outputs[-1].float())
+        outputs, last, cell = recurrence(by_kernel, *to, reset.to(device), *states, residual)
+    assert residual or torch.equal(last, outputs[-1].float())
     assert outputs.dtype == dtype and cell.dtype == torch.float32
     grads = torch.autograd.grad(
         [outputs, cell], [*to, *states], [d_outputs.to(device, dtype), d_cell.to(device)]
@@ -200,7 +197,7 @@ def whole_sequence(
     if nan_before_reset:
         inputs["reset"][n_steps // 2] = True
         inputs["x"][: n_steps // 2] = torch.nan
-    return sequence(by_kernel, device, dtype, **inputs, is_residual=is_residual)
+    return sequence(by_kernel, device, dtype, **inputs, residual=is_residual)
 
 
 @pytest.mark.parametrize(
