@@ -80,27 +80,18 @@ class Adam(_Optimizer):
             if rows:
                 yield factor, weight_decay, rows
 
-    def step(
-        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None = None, max_norm: float = 0.0
-    ) -> None:
-        """Takes one step.
-
-        Args:
-            is_taken: () bool on the device. If false, nothing changes.
-            grad_norm: (), of `grad_norm`. If given, gradients are clipped to `max_norm`.
-            max_norm: longer gradients are scaled down to this norm.
+    def step(self, is_taken: torch.Tensor, grad_norm: torch.Tensor, max_norm: float) -> None:
+        """Takes one step, or changes nothing if `is_taken`, () bool on the device, is false. Longer
+        gradients than `max_norm` are scaled down to it; their norm is `grad_norm` ().
         """
         self.n_steps += is_taken
         self.update(is_taken, grad_norm, max_norm)
 
     @torch.no_grad()
     @fused(lambda *inputs: _update_on_gpu(*inputs), lambda self, *_: has_kernels(self))
-    def update(
-        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None, max_norm: float
-    ) -> None:
+    def update(self, is_taken: torch.Tensor, grad_norm: torch.Tensor, max_norm: float) -> None:
         """Takes a `step` that `n_steps` counts already."""
-        if grad_norm is not None:
-            torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
+        torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
         for factor, weight_decay, rows in self.rows():
             torch._fused_adamw_(  # pyright: ignore[reportPrivateImportUsage]
                 *map(list, zip(*rows)),

@@ -126,7 +126,7 @@ def test_matches_torch_optim_adamw(device):
     for seed in range(4):
         lr.fill_(0.1 / (seed + 1))
         set_gradients(params, torch_params, seed=seed)
-        adam.step(YES.to(device))
+        adam.step(YES.to(device), adam.grad_norm(), math.inf)
         for torch_adam, factor in zip(torch_adams, (1, 3, 1)):
             torch_adam.param_groups[0]["lr"].copy_(lr * factor)
             torch_adam.step()
@@ -142,7 +142,7 @@ def test_skipped_step_changes_nothing():
             set_gradients(adam.parameters, seed=next(seeds) if is_taken else 9)
             if not is_taken:
                 adam.parameters[0].grad.fill_(torch.nan)
-            adam.step(is_taken)
+            adam.step(is_taken, adam.grad_norm(), math.inf)
     assert all(map(torch.equal, skipping, plain))
     assert first.n_steps == second.n_steps == 2
     assert all(map(torch.equal, first.squares, second.squares))

@@ -95,7 +95,7 @@ KERNEL __launch_bounds__(256) adam(AdamParams p) {
     read(means, row.mean, index);
     read(squares, row.square, index);
     read(parameters, row.parameter, index);
-    float clip = p.grad_norm ? fminf(p.max_norm / (*p.grad_norm + 1e-6f), 1.f) : 1.f;
+    float clip = fminf(p.max_norm / (*p.grad_norm + 1e-6f), 1.f);
     float lr = *p.lr * row.lr_factor, n_steps = *p.n_steps;
     float step = lr / (1.f - powf(p.beta1, n_steps));
     float scale = 1.f / sqrtf(1.f - powf(p.beta2, n_steps));

@@ -145,7 +145,7 @@ struct AdamParams {
     AdamRowParams rows[ADAM_ROWS];
     const float* lr;                // ()
     const float* n_steps;           // (), this one included
-    const float* grad_norm;         // (); null: gradients are not clipped
+    const float* grad_norm;         // ()
     const unsigned char* is_taken;  // (), false: nothing changes
     int n_rows;
     float max_norm;
