@@ -63,7 +63,11 @@ def make_trainer(
     policy.generator = SeededGenerator(stream_seed(seed, "policy"))
     learner = factory.make_learner(cfg.learner, policy, seed)
     options = with_defaults(learner, LearnerOptions)
-    cfg = annealed(cfg, options.set_lr is not None)
+    if cfg.learner.anneal == "auto":  # over what is limited, unless lr changes anyway
+        is_free = options.set_lr is not None and not conflicts.changes_lr(cfg.learner)
+        limits = [k for k in ("samples", "seconds") if is_free and getattr(cfg, k) is not None]
+        own = settings.changed(cfg.learner, anneal=[*limits, "never"][0])
+        cfg = settings.changed(cfg, learner=own)
     if cfg.population.size > 1 and options.copy_from is None:
         raise UserError(
             f"{type(learner).__name__} has no copy_from(other), so the members of a population "
@@ -185,13 +189,3 @@ def budget_of(
             recorded = recorded[: loaded.state["updates"]]
     limits = cfg.samples, cfg.seconds, cfg.learner.anneal
     return budget.Budget(*limits, recorded, cfg.rerun is not None)
-
-
-def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:
-    """Returns `cfg` with learner.anneal=auto replaced by samples, seconds or never."""
-    if cfg.learner.anneal != "auto":
-        return cfg
-    is_free = has_set_lr and not conflicts.changes_lr(cfg.learner)
-    limits = [name for name in ("samples", "seconds") if is_free and getattr(cfg, name) is not None]
-    learner = settings.changed(cfg.learner, anneal=[*limits, "never"][0])
-    return settings.changed(cfg, learner=learner)

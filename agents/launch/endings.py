@@ -30,11 +30,12 @@ class Ending(NamedTuple):
     folder: str | None = None  # the run folder, after training finished
 
 
-def ending_of(work: Callable[[], int | None]) -> Ending:
-    """Calls a function, which returns an exit code or None for 0. Raises bugs as they are."""
+def ending_of(work: Callable[[], int | Path | None]) -> Ending:
+    """Calls a function, which returns an exit code, a folder or None. Raises bugs as they are."""
     try:
         with signals.interrupting():
-            return Ending(work() or 0)
+            result = work()
+            return Ending(folder=str(result)) if isinstance(result, Path) else Ending(result or 0)
     except SystemExit as end:  # from argparse, Hydra's help, or a rank that exits silently
         return Ending(cast(int, end.code or 0))
     except UserError as error:

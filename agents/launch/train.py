@@ -42,14 +42,9 @@ def run_rank() -> int:
     console.open_streams()
     console.prefix = facts["prefix"]
     warnings.showwarning = console.warn
-    folder, code = None, 0
-
-    def work() -> None:
-        nonlocal folder
-        folder = run(check.check(settings.Train, facts["settings"]))
-
+    code = 0
     try:
-        ending = endings.ending_of(work)._replace(folder=folder and str(folder))
+        ending = endings.ending_of(lambda: run(check.check(settings.Train, facts["settings"])))
     except Exception as error:
         traceback.print_exc()
         ending = endings.Ending(1, f"{type(error).__name__}: {shortened(error, 400)}")

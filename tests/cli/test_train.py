@@ -21,7 +21,6 @@ from megastep.agents.errors import ConfigErrors, UserError, shortened
 from megastep.agents.factory import make as factory
 from megastep.agents.factory.check import check
 from megastep.agents.factory.settings import Train
-from megastep.agents.factory.trainer import annealed
 from megastep.agents.launch import run as launch_run
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.training import loggers
@@ -47,7 +46,7 @@ def test_files_of_a_run(here):
     names += " provenance.jsonl"
     assert {path.name for path in folder.iterdir()} == {*names.split()}
     written = check(Train, yaml.safe_load((folder / "config.yaml").read_text()))
-    assert written == annealed(configured(f"samples={3 * UPDATE}"))
+    assert written == configured(f"samples={3 * UPDATE}", "learner.anneal=samples")
     rows = json_lines.read(folder / "metrics.jsonl")
     assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
     assert [row["updates"] for row in rows] == [1, 2, 3]
