@@ -118,9 +118,16 @@ def section(run: runs.Run) -> list[str]:
             continue
         try:
             name, by_home = score_by_home(table["episodes"])
-            plans = plans_of(run, table)
+            loaded = folders.load_checkpoint(folders.find(str(run.folder)), False, "cpu")
+            trained, chosen = factory.config_of(loaded), table["evaluation"]
+            geometry = trained.geometry
+            if typed := chosen.get("geometry"):
+                trust.check({"train": {"geometry": typed}}, "An evaluation", "")
+                kind = components.kind_of("geometry", str(typed["name"]))
+                geometry = check.check(kind, typed)
+            plans = factory.homes(trained.env, geometry, str(chosen["split"]))
         except (UserError, ConfigErrors, *ODD) as error:
-            return [f"<p>Homes are not drawn: {html.escape(str(error))}</p>"]
+            return [f"<p>Homes are not drawn: {_text(str(error))}</p>"]
         worst = sorted(by_home, key=by_home.__getitem__)
         if len(worst) < 2 or not all(0 <= home < len(plans) for home in worst):
             continue
@@ -134,7 +141,7 @@ def section(run: runs.Run) -> list[str]:
         shown = [figure(home, plans[home], by_home[home], span) for home in drawn]
         return [
             "<h2>Homes, worst first</h2>",
-            f"<p>{html.escape(text)} <code>record.py home=N</code> films one of this split.</p>",
+            f"<p>{_text(text)} <code>record.py home=N</code> films one of this split.</p>",
             f'<div class="plans">{"".join(shown)}</div>',
         ]
     return []
@@ -148,17 +155,6 @@ def score_by_home(episodes: Mapping[str, Sequence]) -> tuple[str, dict[int, floa
         if agent == agents[0] and home is not None and value is not None:
             values[int(home)].append(float(value))
     return name, {home: float(np.mean(some)) for home, some in values.items()}
-
-
-def plans_of(run: runs.Run, table: Mapping) -> list:
-    """Returns the geometries of the split that a table is about."""
-    loaded = folders.load_checkpoint(folders.find(str(run.folder)), False, "cpu")
-    trained = factory.config_of(loaded)
-    chosen, geometry = table["evaluation"], trained.geometry
-    if typed := chosen.get("geometry"):
-        trust.check({"train": {"geometry": typed}}, "An evaluation", "")
-        geometry = check.check(components.kind_of("geometry", str(typed["name"])), typed)
-    return factory.homes(trained.env, geometry, str(chosen["split"]))
 
 
 def figure(number: int, plan: Mapping, value: float, span: tuple[float, float]) -> str:

@@ -154,22 +154,18 @@ class VectorizedEnv:
         except Exception as error:
             raise EnvError.of(error, f"{self.id}: an environment") from error
 
-    def _check_observations(self, obs) -> None:
-        """Raises BadValue for those outside their space, and warns once of those beyond a Box."""
-        from megastep.hosting.probe import beyond_bounds
-
-        self._n_to_check -= 1
-        for problem, is_box in beyond_bounds(self.vector.single_observation_space, obs):
-            sentence = f"an observation is not in its space: {problem}"
-            if not is_box:
-                raise BadValue.of(sentence, str(self.id))
-            self._n_to_check = 0
-            warnings.warn(f"{self.id}: {sentence}. It is used as it is", stacklevel=4)
-
     def _world(self, obs, reward, terminated, truncated, infos) -> arrdict:
         """Returns the world after a step, in which lanes that had ended before it began again."""
         if self._n_to_check > 0:
-            self._check_observations(obs)
+            from megastep.hosting.probe import beyond_bounds
+
+            self._n_to_check -= 1
+            for problem, is_box in beyond_bounds(self.vector.single_observation_space, obs):
+                sentence = f"an observation is not in its space: {problem}"
+                if not is_box:
+                    raise BadValue.of(sentence, str(self.id))
+                self._n_to_check = 0
+                warnings.warn(f"{self.id}: {sentence}. It is used as it is", stacklevel=3)
         reset, present = self._ended.copy(), infos.get("present")
         self._ended[:] = terminated | truncated if present is None else ~present
 

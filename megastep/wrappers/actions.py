@@ -128,7 +128,13 @@ class TimeLimit(Wrapper):
     @checked
     def __init__(self, env: Env, *, n: Annotated[int, Field(ge=1, le=10**9)]):
         super().__init__(env)
-        self.require_masks("begins episodes of lanes that it has truncated")
+        if not self.takes_masks:
+            raise ValueError(
+                "TimeLimit begins episodes of lanes that it has truncated, for which "
+                f"{type(env).__name__} needs reset(seed=None, mask=None), as "
+                "docs/new-environment.md says under The contract; wrap it with a wrapper of its "
+                "own package, if it has one"
+            )
         self.n = n
         self.ages = torch.zeros(n_lanes(env), dtype=torch.int32, device=env.device)
         self.is_cut = torch.zeros(n_lanes(env), dtype=torch.bool, device=env.device)

@@ -88,15 +88,6 @@ class Wrapper:
         """Numbers that may have schedules, of the environment inside and its own."""
         return *getattr(self.env, "coefficients", ()), *self.own_coefficients
 
-    def require_masks(self, why: str) -> None:
-        """Raises ValueError if the environment inside cannot begin episodes of some lanes alone."""
-        if not takes_masks(self.env):
-            raise ValueError(
-                f"{type(self).__name__} {why}, for which {type(self.env).__name__} needs "
-                "reset(seed=None, mask=None), as docs/new-environment.md says under The contract; "
-                "wrap it with a wrapper of its own package, if it has one"
-            )
-
 
 class Unmasked(Wrapper):
     """Base of wrappers that change actions. ValueError: the environment has action masks."""
