@@ -30,9 +30,10 @@ from megastep import workers
 from megastep.agents import console, package
 from megastep.agents.cli.compose import MAIN, Composer
 from megastep.agents.cli.words import key_of
+from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import settings
-from megastep.agents.launch import gpu_slots, rank, signals
+from megastep.agents.launch import gpu_slots, signals
 from megastep.agents.launch.again import AUTO
 from megastep.agents.runs import folders, scores
 from megastep.agents.types import Row
@@ -103,7 +104,10 @@ def metric_of(words: list[str]) -> tuple[str, list[str]]:
 
 def sweep(composer: Composer, words: list[str]) -> int:
     """Checks all jobs, then has Hydra run them, past those that fail. Returns the exit code."""
-    rank.refuse("The jobs of a sweep start their own ranks; leave torchrun out, and add ranks=")
+    if environment.rank_info():
+        cure = "leave torchrun out, and add ranks="
+        problem = UserError(f"The jobs of a sweep start their own ranks; {cure}")
+        raise problem if environment.rank() == 0 else SystemExit(problem.code)
     metric, words = metric_of(words)
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:

@@ -52,10 +52,8 @@ def all_gather(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def pool_moments(*moments: Moments) -> list[Moments]:
-    """Pools the moments (count, mean, variance) of all ranks (Chan et al. 1979).
-
-    Takes one collective operation, however many moments there are. Shapes may differ among them,
-    but not among ranks.
+    """Pools the moments (count, mean, variance) of all ranks (Chan et al. 1979), in one collective
+    operation. Shapes may differ among moments, but not among ranks.
     """
     if n_pooled() == 1 or not moments:
         return list(moments)

@@ -161,12 +161,10 @@ def first_duels(
     max_steps: int = MAX_STEPS,
     own: torch.Tensor | None = None,
 ) -> arrdict:
-    """Plays one duel per environment, from a reset.
-
-    A duel ends at the first step that is terminal for any of its agents; `score_pairs` decides who
-    won. It is a draw if the episode is truncated or `max_steps` is reached first. With more than
-    two agents, `opponent` controls all the others, and the score is the mean over decided pairs.
-    Agents of one role are a team: `policy` controls one team and `opponent` the others.
+    """Plays one duel per environment, from a reset, to the first step that is terminal for any of
+    its agents; `score_pairs` decides who won. It is a draw if the episode is truncated or
+    `max_steps` is reached first. `opponent` controls all other agents than `policy`, or teams, as
+    agents of one role are, and the score is the mean over decided pairs.
 
     Args:
         seed: of the action sampling.

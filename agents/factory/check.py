@@ -46,28 +46,25 @@ def check(kind: type[T], tree: Tree, names: Callable[[], Iterable[str]] = tuple)
     return cast(T, chosen)
 
 
-def as_tree(chosen: Any, prefix: str = "") -> Tree:
-    """The inverse of `check`. Raises ConfigErrors for values that no file can hold."""
-    tree = {}
-    for name, field in type(chosen).__pydantic_fields__.items():
-        value = getattr(chosen, name)
-        try:
-            tree[name] = _plain(value, f"{prefix}{name}.")
-        except PydanticSerializationError:
-            if value is not field.get_default(call_default_factory=True):
-                text = f"{value!r} cannot be kept in a checkpoint; use numbers, words and lists"
-                raise ConfigErrors([(prefix + name, text)]) from None
-    return tree
-
-
-def _plain(value, prefix="") -> Any:
-    """Returns a value as JSON has it, but with keys, infinity and NaN as they are."""
+def as_tree(value: Any, prefix: str = "") -> Any:
+    """The inverse of `check`: a value as JSON has it, but with keys, infinity and NaN as they are.
+    Raises ConfigErrors for settings that no file can hold.
+    """
     if dataclasses.is_dataclass(value):
-        return as_tree(value, prefix)
+        kind, tree = cast(Any, type(value)), {}
+        for name, field in kind.__pydantic_fields__.items():
+            part = getattr(value, name)
+            try:
+                tree[name] = as_tree(part, f"{prefix}{name}.")
+            except PydanticSerializationError:
+                if part is not field.get_default(call_default_factory=True):
+                    text = f"{part!r} cannot be kept in a checkpoint; use numbers, words and lists"
+                    raise ConfigErrors([(prefix + name, text)]) from None
+        return tree
     if isinstance(value, dict):
-        return {_plain(key): _plain(part, f"{prefix}{key}.") for key, part in value.items()}
+        return {as_tree(key): as_tree(part, f"{prefix}{key}.") for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
+        return [as_tree(part) for part in value]
     is_scalar = type(value) in (str, int, float, bool, type(None))
     return value if is_scalar else to_jsonable_python(value)
 

@@ -1,9 +1,7 @@
 """Starts the ranks of `ranks=2` on this machine and waits for them.
 
-This process composes and checks the settings once and writes them to a temporary *job folder*. Each
-rank reads them there, and writes there how it ended. Only this process prints errors and forwards
-signals; its exit code is that of a run in one process. It also keeps the store through which ranks
-find each other, at an address that only this machine reaches.
+This process writes the checked settings to a temporary *job folder*, in which ranks write how they
+ended. It alone prints errors and forwards signals, and keeps the store of the ranks.
 """
 
 import contextlib

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from megastep.agents import console
 from megastep.agents.distributed import environment
-from megastep.agents.errors import UserError, user_errors
+from megastep.agents.errors import user_errors
 from megastep.agents.launch import endings, signals
 
 if TYPE_CHECKING:
@@ -18,12 +18,6 @@ GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
 #: The team that this process has joined.
 _team = None
 T = TypeVar("T")
-
-
-def refuse(problem: str) -> None:
-    """Raises UserError on rank 0 if torchrun started this process; other ranks exit silently."""
-    if environment.rank_info():
-        raise UserError(problem) if environment.rank() == 0 else SystemExit(UserError.code)
 
 
 @contextlib.contextmanager

@@ -10,11 +10,8 @@
                    which are equal on all ranks. The files above are rank 0's
 
 The .pt files hold plain dicts of tensors, numbers and strings. Resuming reads all files; evaluation
-only `state.pt`. JSON is read without PyTorch.
-
-A checkpoint is written to a temporary folder, flushed to disk and renamed, so a reader sees a
-complete checkpoint or none. A second checkpoint of the same step is `step_<N>-2`; the first is
-deleted once the second is written.
+only `state.pt`. A reader sees a complete checkpoint or none. A second checkpoint of the same step
+is `step_<N>-2`; the first is deleted once the second is written.
 """
 
 from __future__ import annotations

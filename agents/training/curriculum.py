@@ -1,9 +1,8 @@
 """A curriculum: which homes new episodes take place in. Scores of homes come from the episodes that
 train, and the environment draws homes by them.
 
-T time, B lanes, D layouts. Everything stays on the device and nothing synchronises but `stats`.
-Sums are of integers (fixed point), so that they do not depend on the order of addition and runs
-repeat bit for bit. With several ranks, each has scores of its own episodes and draws by them.
+T time, B lanes, D layouts. Nothing synchronises but `stats`. Sums are of integers (fixed point), so
+that runs repeat bit for bit. With several ranks, each has scores of its own episodes.
 """
 
 from collections.abc import Sequence
