@@ -16,9 +16,7 @@ from megastep.agents.distributed import environment
 QUITTING = (signal.SIGINT, signal.SIGTERM)
 #: Signals by which clusters announce that SIGTERM will follow.
 ANNOUNCING = (signal.SIGUSR1, signal.SIGUSR2)
-SIGNALS = [*QUITTING, *ANNOUNCING, signal.SIGHUP]
-if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # by nohup
-    SIGNALS.remove(signal.SIGHUP)
+SIGNALS = (*QUITTING, *ANNOUNCING, signal.SIGHUP)
 #: Seconds within which a second signal counts as a repetition of the first: `timeout` and a closing
 #: terminal send two.
 SAME = 0.3
@@ -105,15 +103,17 @@ def deferred() -> Iterator[None]:
 
 def stop(process: int) -> None:
     """Stops a process gracefully; unlike SIGTERM, SIGHUP never counts as a second signal."""
+    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     with contextlib.suppress(ProcessLookupError):
-        os.kill(process, signal.SIGHUP if signal.SIGHUP in SIGNALS else signal.SIGTERM)
+        os.kill(process, signal.SIGTERM if is_ignored else signal.SIGHUP)
 
 
 def _install(handler: Callable) -> dict[int, Callable | int | None]:
     """Returns the previous handlers. Does nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return {}
-    return {number: signal.signal(number, handler) for number in SIGNALS}
+    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # by nohup
+    return {n: signal.signal(n, handler) for n in SIGNALS[: -1 if is_ignored else None]}
 
 
 def _write(stream: TextIO | None, line: str) -> None:
