@@ -13,9 +13,9 @@ import math
 import os
 import stat
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from megastep.atomic_files import write_atomically
 
@@ -77,6 +77,26 @@ def arrays(
     body, _ = fetch(f"{prefix}{key.hexdigest()[:20]}", write)
     with np.load(io.BytesIO(body)) as loaded:
         return dict(loaded)
+
+
+def records(
+    prefix: str, parts: Iterable[object], build: "Callable[[], Sequence[Mapping]]", *limits: Any
+) -> "list[dict[str, Any]]":
+    """Returns what `build` does, as `arrays`: dicts of numbers and arrays, with the same keys."""
+    import numpy as np
+
+    def joined() -> "dict[str, np.ndarray]":
+        rows = [{key: np.asarray(value) for key, value in row.items()} for row in build()]
+        ends = {key: np.concatenate([row[key].ravel() for row in rows]) for key in rows[0]}
+        return ends | {f"{key} shapes": np.array([r[key].shape for r in rows], int) for key in ends}
+
+    columns, stored = {}, arrays(prefix, parts, joined, *limits)
+    for key in [key for key in stored if f"{key} shapes" in stored]:
+        shapes = stored[f"{key} shapes"]
+        values = np.split(stored[key], shapes.prod(1).cumsum()[:-1])
+        pairs = zip(values, shapes.tolist())
+        columns[key] = [v.reshape(shape) if shape else v.item() for v, shape in pairs]
+    return [dict(zip(columns, row)) for row in zip(*columns.values())]
 
 
 def warn(problem: str) -> None:

@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import gc
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -214,11 +213,7 @@ class Composer:
                 errors.append((key_of(one), text))
             else:
                 typed.append(typed_word(one))
-        checked = self.checked(typed, errors)
-        if not gc.isenabled():  # stopped by `entry`
-            gc.freeze()
-            gc.enable()
-        return checked
+        return self.checked(typed, errors)
 
     def checked(self, typed: list[Typed], errors: list) -> tuple[Any, DictConfig]:
         """Returns what `compose` does. `errors` has what is wrong already."""

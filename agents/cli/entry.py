@@ -1,6 +1,5 @@
 """Starts commands. Signals and closed streams are handled before anything else is imported."""
 
-import gc
 import importlib
 import sys
 
@@ -53,7 +52,6 @@ def run_command(name: str, words: list[str] | None = None) -> int:
     """Runs a command, by default with the words of this process. Returns the exit code."""
     sys.argv[1:] = words = sys.argv[1:] if words is None else words
     signals.exit_on_signals(name)
-    gc.disable()  # until settings are known: imports leave no garbage, and it would be looked for
     from megastep.agents import console
 
     console.open_streams()
@@ -66,5 +64,3 @@ def run_command(name: str, words: list[str] | None = None) -> int:
     except UserError as error:
         console.say(f"{package.command(name)}: {error}", sys.stderr)
         return error.code
-    finally:
-        gc.enable()

@@ -7,24 +7,23 @@ import pkgutil
 from collections.abc import Iterator, Mapping
 
 _SHARED = ("common", "first_person")  # modules that hold no environment
+_NAMES = [file.name for file in pkgutil.iter_modules(__path__) if file.name not in _SHARED]
 
 
 class _Envs(Mapping[str, type]):
     """A module's environment is the first of its ``__all__``, its own name but for capitals."""
 
-    names = [file.name for file in pkgutil.iter_modules(__path__) if file.name not in _SHARED]
-
     def __getitem__(self, name: str) -> type:
-        if name not in self.names:
+        if name not in _NAMES:
             raise KeyError(name)
         module = importlib.import_module(f"{__name__}.{name}")
         return getattr(module, module.__all__[0])
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.names)
+        return iter(_NAMES)
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(_NAMES)
 
 
 #: The environments by module name.
@@ -33,13 +32,8 @@ ENVS = _Envs()
 
 def __getattr__(name) -> object:
     if name == "__all__":
-        return __dir__()
-    if name in _SHARED or name in ENVS:
-        return importlib.import_module(f"{__name__}.{name}")
-    if name.lower() in ENVS and (env := ENVS[name.lower()]).__name__ == name:
-        return env
-    raise AttributeError(f"megastep.envs has no {name}; its modules: {', '.join(ENVS)}")
-
-
-def __dir__() -> list[str]:
-    return ["ENVS", *sorted(env.__name__ for env in ENVS.values())]
+        return ["ENVS", *sorted(env.__name__ for env in ENVS.values())]
+    if name.lower() not in _NAMES:
+        raise AttributeError(f"megastep.envs has no {name}; its modules: {', '.join(_NAMES)}")
+    module = importlib.import_module(f"{__name__}.{name.lower()}")
+    return module if name in _NAMES else getattr(module, name)

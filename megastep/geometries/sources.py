@@ -43,12 +43,6 @@ def _draw(count, n, split, seed) -> list[int]:
     return databases.draw(databases.split_range(count, split), n, seed)
 
 
-def _generated(generate, seeds, each=500, **options) -> list[dotdict]:
-    """Returns what a function generates, in processes of at least so many different seeds."""
-    plans = databases.generated(generate, [*dict.fromkeys(seeds)], each, **options)
-    return [plans[seed] for seed in seeds]
-
-
 def box(n: Count = 1, split: str = "training", seed: Seed = 1, width: float = 5.0) -> list[dotdict]:
     """Returns one empty square room, n times.
 
@@ -113,7 +107,7 @@ def homes(
     if density == 1 and clutter == 0:
         return [databases.home(i, outer) for i in indices]
     options = dict(density=float(density), clutter=float(clutter), outer=outer)
-    return _generated(databases.dense_home, indices, databases.SEEDS_EACH, **options)
+    return databases.generated(databases.dense_home, indices, databases.SEEDS_EACH, **options)
 
 
 def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
@@ -144,6 +138,12 @@ def houseexpo(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[d
     return databases.pick("houseexpo", n, split, seed)
 
 
+def _generated(module, n, split, seed, **options) -> list[dotdict]:
+    """Returns mazes that a module generates."""
+    indices = _draw(module.COUNT, n, split, seed)
+    return databases.generated(module.generate, indices, **options)
+
+
 @checked
 def maze(
     n: Count = 512,
@@ -164,8 +164,7 @@ def maze(
         braid: fraction of the dead ends that is opened: 0 leaves a perfect maze.
     """
     lengths = dict(corridor=corridor, thickness=thickness)
-    indices = _draw(mazes.COUNT, n, split, seed)
-    return _generated(mazes.generate, indices, size=size, braid=braid, **lengths)
+    return _generated(mazes, n, split, seed, size=size, braid=braid, **lengths)
 
 
 @checked
@@ -183,8 +182,7 @@ def memory_maze(
         size: cells per side: 9, 11, 13 or 15.
         cell: side of a cell, in metres.
     """
-    indices = _draw(memory_mazes.COUNT, n, split, seed)
-    return _generated(memory_mazes.generate, indices, size=size, cell=cell)
+    return _generated(memory_mazes, n, split, seed, size=size, cell=cell)
 
 
 @checked
@@ -203,8 +201,7 @@ def quadrant(
         width: width of the outer room, in metres. The inner room has half of it.
         opening: width of the openings, in metres.
     """
-    indices = _draw(quadrants.COUNT, n, split, seed)
-    return _generated(quadrants.generate, indices, width=width, opening=opening)
+    return _generated(quadrants, n, split, seed, width=width, opening=opening)
 
 
 @checked

@@ -20,7 +20,7 @@ from megastep.modules.lifecycle import CounterGenerator, derived_seed
 T = TypeVar("T")
 CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other spawned agents
 PREFIX = "spawn-points-"  # of the files in the cache
-MAX_FILES = 64  # in the cache, half a megabyte each for 512 layouts
+MAX_FILES = 64  # of each kind in the cache, about a megabyte each for 512 layouts
 MIN_CACHED = 32  # layouts; the search is quick for fewer
 MAX_SPAWNS = 1_000_000  # points per layout; four times as many are drawn at once
 BATCHES = 20  # of candidate points; then the search ends
@@ -187,23 +187,18 @@ def cached_points(
         return dict(points=np.stack(points).astype(np.float32))
 
     arguments = n, n_agents, radius, seed
-    return cached(PREFIX, Path(__file__), geometries, arguments, build, MAX_FILES)["points"]
+    return cached(PREFIX, Path(__file__), geometries, arguments, build)["points"]
 
 
 def cached(
-    prefix: str,
-    source: Path,
-    geometries: Sequence[dotdict],
-    arguments: object,
-    build: Callable[[], dict[str, np.ndarray]],
-    max_files: int = 16,
+    prefix: str, source: Path, geometries: Sequence[dotdict], arguments: object, build: Callable
 ) -> dict[str, np.ndarray]:
-    """Returns what ``build``, a function in the file ``source``, makes of geometries and arguments.
-    Keeps that of many geometries in the cache, in files of a ``prefix``.
+    """Returns the arrays that ``build``, a function in the file ``source``, makes of geometries and
+    arguments. Keeps those of many geometries in the cache, in files of a ``prefix``.
     """
     if len(geometries) < MIN_CACHED:
         return build()
-    return cache.arrays(prefix, (source, arguments, *contents(geometries)), build, max_files)
+    return cache.arrays(prefix, (source, arguments, *contents(geometries)), build, MAX_FILES)
 
 
 class FreePoints:

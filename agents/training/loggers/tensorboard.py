@@ -16,13 +16,10 @@ if TYPE_CHECKING:
 #: Of the film in TensorBoard, which shows GIFs: pixels, and frames.
 HEIGHT, N_FRAMES = 360, 100
 WRITER = "torch.utils.tensorboard"
-#: Seconds until the writer is imported, which takes most of a second, in which training would wait.
-IMPORT_AFTER = 10.0
 
 
 class TensorBoard:
-    """Writes TensorBoard event files to the folder `tensorboard` of a run, in a thread, from a few
-    seconds after its start on.
+    """Writes TensorBoard event files to the folder `tensorboard` of a run, in a thread.
 
     At the end of a run it has the settings as hyperparameters with the final numbers, the film, and
     the table of the evaluation. A resumed run's events after `step` are discarded.
@@ -31,7 +28,8 @@ class TensorBoard:
     def __init__(self, folder: Path, step: int, config: dict | None = None):
         self.folder, self.step, self.config = folder / "tensorboard", step, config or {}
         self._reports: list[tuple[int, dict[str, float | str]]] = []
-        self._import = threading.Timer(IMPORT_AFTER, importlib.import_module, (WRITER,))
+        # for most of a second, in which the first updates would wait
+        self._import = threading.Timer(10, importlib.import_module, (WRITER,))
         self._import.daemon = True
         self._import.start()
 
@@ -89,6 +87,5 @@ class TensorBoard:
     def close(self) -> None:
         """Waits until everything is written."""
         self._flush()
-        self._import.cancel()
         if "writer" in vars(self):
             self.writer.close()

@@ -209,7 +209,7 @@ class HideAndSeek(FirstPerson):
         for name, kind in self._kinds.items():
             radii += [math.hypot(kind.side, kind.width or kind.side) / 2] * kind.count
             rooms += [starts.ANYWHERE if name == "ramp" else inner] * kind.count
-        table = starts.cached_starts(geometries, N_STARTS, radii, rooms, self.seed)
+        table = starts.starts(geometries, N_STARTS, radii, rooms, self.seed)
         self.starts = torch.from_numpy(table).to(core.device)
         return super()._furnish(geometries, resample)
 

@@ -18,15 +18,6 @@ PREFIX = "hideandseek-"  # of the files in the cache, 3 MB each for 500 layouts
 ANYWHERE, OUTER, INNER = range(3)  # where something may be put
 
 
-def cached_starts(
-    geometries: Sequence[dotdict], n: int, radii: Sequence[float], rooms: Sequence[int], seed: int
-) -> np.ndarray:
-    """Returns :func:`starts`. Keeps those of many layouts in the cache."""
-    arguments = n, tuple(radii), tuple(rooms), seed
-    build = lambda: dict(starts=starts(geometries, *arguments))  # noqa: E731
-    return cached(PREFIX, Path(__file__), geometries, arguments, build)["starts"]
-
-
 def starts(
     geometries: Sequence[dotdict], n: int, radii: Sequence[float], rooms: Sequence[int], seed: int
 ) -> np.ndarray:
@@ -34,8 +25,13 @@ def starts(
     discs of these radii are 5 cm clear of each other and of every wall, each in its room: ANYWHERE,
     OUTER, or INNER if they fit there. ValueError if a geometry lacks that room, or has no space.
     """
-    found = per_geometry(geometries, seed, lambda g, random: _starts(g, n, radii, rooms, random))
-    return np.stack(found).astype(np.float32)
+    arguments = n, tuple(radii), tuple(rooms)
+
+    def build() -> dict[str, np.ndarray]:
+        draw = lambda g, random: _starts(g, *arguments, random)  # noqa: E731
+        return dict(starts=np.stack(per_geometry(geometries, seed, draw)).astype(np.float32))
+
+    return cached(PREFIX, Path(__file__), geometries, (*arguments, seed), build)["starts"]
 
 
 def _starts(g, n, radii, rooms, random) -> np.ndarray:

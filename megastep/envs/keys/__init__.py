@@ -13,7 +13,7 @@ from megastep.dotdict import dotdict
 from megastep.engine.launch_params import object_params, seed_params
 from megastep.envs.common import Weight, judged, world_of
 from megastep.envs.first_person import FirstPerson, images
-from megastep.envs.keys.episodes import cached_episodes
+from megastep.envs.keys.episodes import episodes
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.modules.kinds import REACH
 from megastep.modules.lifecycle import derived_seed
@@ -95,7 +95,7 @@ class Keys(FirstPerson):
 
     def _furnish(self, geometries, resample) -> modules.RandomSpawns:
         self.seed = derived_seed(self.core.seed, "keys")
-        tables = cached_episodes(geometries, N_EPISODES, self.n_colours, self.seed)
+        tables = episodes(geometries, N_EPISODES, self.n_colours, self.seed)
         discs = modules.Disc(self.n_colours, RADIUS), modules.Disc(1, RADIUS)
         kinds = {"key": discs[0], "goal": discs[1], "door": modules.Door()}
         colours = [*[*modules.COLOURS][: self.n_colours], LOCKED, GOAL]

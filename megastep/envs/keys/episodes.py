@@ -65,28 +65,22 @@ class Areas:
         return self.labels[row, column]
 
 
-def cached_episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:
-    """Returns :func:`episodes`. Keeps those of many layouts in the cache."""
-    arguments = n, n_colours, seed
-    build = lambda: episodes(geometries, *arguments)._asdict()  # noqa: E731
-    return Episodes(**cached(PREFIX, Path(__file__), geometries, arguments, build))
-
-
 def episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:
     """Returns n episodes of each geometry. ValueError: no doorway between areas, or no room."""
     n_doors = max(len(doors_of(g)) for g in geometries)
-    found = per_geometry(
-        geometries, seed, lambda g, random: _episodes(g, n, n_colours, n_doors, random)
-    )
-    starts, keys, goals, doors = (np.stack(parts) for parts in zip(*found))
-    if np.isnan(keys).all():
-        raise ValueError(
-            f"geometry {geometries[0].id} has no doorway between two of its parts, nor has any "
-            "other: Keys needs homes with doors, such as geometry=homes"
-        )
-    return Episodes(
-        starts.astype(np.float32), keys.astype(np.float32), goals.astype(np.float32), doors
-    )
+
+    def build() -> dict[str, np.ndarray]:
+        draw = lambda g, random: _episodes(g, n, n_colours, n_doors, random)  # noqa: E731
+        *points, doors = map(np.stack, zip(*per_geometry(geometries, seed, draw)))
+        starts, keys, goals = (part.astype(np.float32) for part in points)
+        if np.isnan(keys).all():
+            raise ValueError(
+                f"geometry {geometries[0].id} has no doorway between two of its parts, nor has any "
+                "other: Keys needs homes with doors, such as geometry=homes"
+            )
+        return Episodes(starts, keys, goals, doors)._asdict()
+
+    return Episodes(**cached(PREFIX, Path(__file__), geometries, (n, n_colours, seed), build))
 
 
 def _episodes(g, n, n_colours, n_doors, random) -> tuple[np.ndarray, ...]:

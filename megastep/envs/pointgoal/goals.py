@@ -145,24 +145,14 @@ def all_geodesics(
 def _cached(found, geometries, radius, seed) -> list[Geodesics]:
     """Returns the list of what the iterator `found` yields, from the cache if it holds it."""
 
-    def build() -> dict[str, np.ndarray]:
+    def build() -> list[dict]:
         from rich.console import Console
         from rich.progress import track
 
         n = len(geometries)
         description = f"Computing the shortest paths in {n:,} layouts"
         bar: dict = dict(console=Console(stderr=True), disable=n < MIN_PROGRESS)
-        layouts = list(track(found, description, n, **bar))
-        rest = [name for name in Geodesics._fields if name != "fields"]
-        arrays = {name: np.stack([getattr(layout, name) for layout in layouts]) for name in rest}
-        shapes = np.array([layout.fields.shape for layout in layouts])
-        flat = np.concatenate([layout.fields.reshape(-1) for layout in layouts])
-        return dict(arrays, shapes=shapes, flat=flat)
+        return [layout._asdict() for layout in track(found, description, n, **bar)]
 
     parts = *SOURCES, radius, seed, *contents(geometries)
-    arrays = cache.arrays(PREFIX, parts, build, MAX_FILES, MAX_BYTES)
-    shapes, flat = arrays.pop("shapes"), arrays.pop("flat")
-    fields = np.split(flat, shapes.prod(1).cumsum()[:-1])
-    shaped = [field.reshape(shape) for field, shape in zip(fields, shapes)]
-    rest = [dict(zip(arrays, values)) for values in zip(*arrays.values())]
-    return [Geodesics(fields=field, **parts) for field, parts in zip(shaped, rest, strict=True)]
+    return [Geodesics(**g) for g in cache.records(PREFIX, parts, build, MAX_FILES, MAX_BYTES)]
