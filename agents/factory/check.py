@@ -19,9 +19,7 @@ T = TypeVar("T")
 
 
 def check(kind: type[T], tree: Tree, names: Callable[[], Iterable[str]] = tuple) -> T:
-    """Returns checked settings from nested dicts. ConfigErrors names all errors at once, with the
-    nearest key of what `names` returns, too.
-    """
+    """Returns checked settings from nested dicts. ConfigErrors names all errors at once."""
     try:
         chosen = components.adapter(kind).validate_python(tree)
     except ValidationError as error:

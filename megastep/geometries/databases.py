@@ -148,9 +148,6 @@ def dense_home(seed: int, density: float, clutter: float, outer: bool) -> dotdic
     return dotdict(id=seed, walls=walls, **kept, n_outer=n_outer)
 
 
-# ---- Generated floor plans ----
-
-
 def generated(
     generate: Callable[..., dotdict], seeds: Sequence[int], each: int = 500, **options: object
 ) -> list[dotdict]:
