@@ -39,7 +39,7 @@ def test_make_targets_and_scripts_exist(path):
 
 
 def test_all_of_ci_runs_on_github_too():
-    lines = re.findall(r"^make (.*)", (ROOT / ".ci/run").read_text(), re.M)
+    lines = re.findall(r"^[^#\n]*make (.*)", (ROOT / ".ci/run").read_text(), re.M)
     targets = {word for line in lines for word in line.split() if word[0] != "-"}
     matrix = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
     assert targets <= {*matrix["jobs"]["make"]["strategy"]["matrix"]["target"]}
