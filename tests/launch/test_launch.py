@@ -17,7 +17,7 @@ from megastep.agents.launch import gpu, launcher
 from megastep.agents.launch.endings import LOST, Ending
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import checkpoint, json_lines
-from tests.helpers import tiny
+from tests.helpers import ranks, tiny
 from tests.helpers.hosts import children
 from tests.helpers.processes import Forked, forked, is_running, wait_until
 from tests.helpers.ranks import HUNG, ROOT
@@ -202,19 +202,6 @@ def wait_for_end(process):
     return process.returncode, out, err, time.monotonic() - began
 
 
-def updates(here):
-    return [row["updates"] for row in json_lines.read(here / "run" / "metrics.jsonl")]
-
-
-@pytest.mark.slow
-def test_one_voice(here):
-    with started(here, f"samples={8 * UPDATE}", "finish.evaluate=true", "finish.episodes=8") as run:
-        code, out, err, _ = wait_for_end(run)
-    assert (code, err) == (0, "") and out.startswith("Training on 2 x cpu in run\n")
-    assert out.count("samples ·") == 1 and out.count("8 episodes") == 1
-    assert not any((here / "tmp").iterdir()) and updates(here) == [*range(1, 9)]
-
-
 @pytest.mark.parametrize(
     "number, is_group, base, update",
     [
@@ -224,7 +211,9 @@ def test_one_voice(here):
     ],
     ids=["SIGINT-cpu", "SIGTERM-cpu", "SIGINT-cuda"],
 )
-def test_signal_saves_once(here, number, is_group, base, update):
+def test_signal_saves_once_and_a_resumed_run_has_one_voice(
+    here, number, is_group, base, update, capfd
+):
     with saving(here, base=base) as run:
         (os.killpg if is_group else os.kill)(run.pid, number)
         code, out, err, _ = wait_for_end(run)
@@ -233,9 +222,13 @@ def test_signal_saves_once(here, number, is_group, base, update):
     resume = "To continue: python train.py resume=run"
     assert err == f"train.py: Stopped after {samples:,} samples. {resume}\n"
     assert not any((here / "tmp").iterdir()) and not (here / "run" / "lock").exists()
-    total = samples + 2 * update
-    assert train.main(["resume=run", f"samples={total}"]) == 0  # with two ranks again
+    total, finish = samples + 2 * update, ["finish.evaluate=true", "finish.episodes=8"]
+    assert train.main(["resume=run", f"samples={total}", *finish]) == 0  # with two ranks again
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == total
+    out, err = capfd.readouterr()
+    assert not err and out.count("samples ·") == out.count("8 episodes") == 1
+    rows = json_lines.read(here / "run" / "metrics.jsonl")
+    assert [row["updates"] for row in rows] == [*range(1, total // update + 1)]
 
 
 @pytest.mark.parametrize(
@@ -335,21 +328,13 @@ def test_learner_that_does_not_average(here):
     assert "differs on rank 1; " in err and "average_gradients" in err and err.count("\n") == 1
 
 
-def torchrun(here, *words):
-    """Returns the exit code, stdout and stderr of torchrun with two ranks."""
-    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *words]
-    process = Forked(command, here, os.environ | {"PYTHONPATH": str(ROOT)})
-    out, err = process.communicate(timeout=HUNG)
-    return process.returncode, out, err
-
-
 @pytest.mark.slow
 def test_torchrun(here):
-    script = str(ROOT / "train.py")
-    code, out, _ = torchrun(here, script, *TINY, f"samples={3 * UPDATE}")
-    assert code == 0 and out.startswith("Training on 2 x cpu in run\n")
-    code, _, err = torchrun(here, script, *TINY, "ranks=3", "folder=other")
-    assert code != 0 and not (here / "other").exists() and err.count("ranks: 3 is not") == 1
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    command += [ROOT / "train.py", *TINY, f"samples={3 * UPDATE}"]
+    process = Forked(command, here, os.environ | {"PYTHONPATH": str(ROOT)})
+    out, err = process.communicate(timeout=HUNG)
+    assert process.returncode == 0 and out.startswith("Training on 2 x cpu in run\n"), err
 
 
 DIFFERING = """
@@ -362,6 +347,9 @@ sys.exit(train.main([*sys.argv[1:], "learner.lr=0.00" + str(1 + int(os.environ["
 @pytest.mark.slow
 def test_ranks_with_different_words(here):
     (here / "differing.py").write_text(DIFFERING)
-    code, _, err = torchrun(here, "differing.py", *TINY, f"samples={9 * UPDATE}")
-    line = r"The ranks drift apart: policy\.\S+ differs on rank 1; start all with the same options"
-    assert code != 0 and len(re.findall(line, err)) == 1, err
+    both = ranks.run([here / "differing.py", *TINY, f"samples={9 * UPDATE}"])
+    line = (
+        r"The ranks drift apart: policy\.\S+ differs on rank 1; .*Start all ranks with"
+    )
+    assert all(one.returncode for one in both)
+    assert any(re.search(line, one.stderr) for one in both), both
