@@ -1,10 +1,8 @@
 """megastep from Python, as docs/python.md has it."""
 
 import importlib
-import os
 import re
 import shlex
-import subprocess
 import sys
 import warnings
 
@@ -219,18 +217,3 @@ def test_threads_that_spin_are_warned_of_once(monkeypatch):
         monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
         devices._warn_of_spinning.cache_clear()
         devices.threads()
-
-
-LAZY = """
-import os, sys
-import megastep
-assert "torch" not in sys.modules and os.environ["OMP_WAIT_POLICY"] == "passive"
-from megastep import core, envs
-assert not [name for name in sys.modules if name.startswith(("hydra", "megastep.agents"))]
-"""
-
-
-@pytest.mark.slow
-def test_the_simulator_imports_no_learner():
-    env = {key: text for key, text in os.environ.items() if key != "OMP_WAIT_POLICY"}
-    subprocess.run([sys.executable, "-c", LAZY], cwd=ROOT, env=env, check=True, timeout=300)

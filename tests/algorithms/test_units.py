@@ -37,7 +37,7 @@ class InUnits:
 
 
 @functools.cache
-def learnt(kind, n_updates=6, **units):
+def learnt(kind, n_updates=4, **units):
     """Returns the weights after some updates, without statistics, and the metrics."""
     torch.manual_seed(0)
     policy, learner = LEARNERS[kind].make(InUnits(**units), width=8)

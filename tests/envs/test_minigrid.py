@@ -122,7 +122,7 @@ def test_agents_play_here_as_in_the_original(tmp_path, monkeypatch):
         ["env=gymnasium", f"env.id=minigrid:{id}", f"env.wrappers=[{wrapper}]"],
     )
     small = "agent.encoder=categories agent.core=none agent.width=32 device=cpu".split()
-    for name, trained_in, samples in ("here", here, 40000), ("there", there, 2000):
+    for name, trained_in, samples in ("here", here, 25000), ("there", there, 2000):
         words = [*small, "env.n_envs=32", f"samples={samples}", f"folder={name}"]
         assert train.main([*trained_in, *words]) == 0
         rows = []

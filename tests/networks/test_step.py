@@ -63,8 +63,9 @@ def check(kind, results, inputs, is_residual):
 
 
 @KINDS
-@RESIDUAL
-@pytest.mark.parametrize("n_lanes, width", [(1, 256), (129, 64), (37, 192)])
+@pytest.mark.parametrize(
+    "n_lanes, width, is_residual", [(1, 256, True), (129, 64, False), (37, 192, True)]
+)
 def test_step_matches_its_twin_in_every_order(
     cuda_on_cpu, monkeypatch, kind, is_residual, n_lanes, width
 ):
