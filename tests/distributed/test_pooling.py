@@ -35,7 +35,7 @@ LANES = [0, 4], [1, 2, 3, 5]
 
 def some_lanes(rollout, lanes):
     """Returns a rollout of some of the lanes."""
-    part = Rollout(T, len(lanes), OBS, MOVES, rollout.state[lanes], None, PRIVILEGED, torch.float32)
+    part = Rollout(T, len(lanes), OBS, MOVES, rollout.state[lanes], None, PRIVILEGED)
     for name in "obs privileged starts learns actions logprobs values reward".split():
         getattr(part, name)[:] = getattr(rollout, name)[:, lanes]
     part.terminal[:], part.truncated[:] = rollout.terminal[:, lanes], rollout.truncated[:, lanes]

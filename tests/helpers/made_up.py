@@ -8,7 +8,7 @@ from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
 
 T, B, WIDTH = 8, 6, 16
-OBS, MOVES = spaces.MultiVector(1, 4), spaces.MultiDiscrete(1, 3)
+OBS, MOVES = spaces.MultiVector(1, 4, dtype=torch.float32), spaces.MultiDiscrete(1, 3)
 PRIVILEGED = spaces.MultiVector(1, 2)
 
 
@@ -58,7 +58,7 @@ def made_up(seed=0, device="cpu", privileged=None, values=True, width=WIDTH):
         # a policy far from uniform, so that gradients differ by action
         policy.output.linear.weight.mul_(100)
     state = policy.initial(B)
-    rollout = Rollout(T, B, OBS, MOVES, state, device, privileged, torch.float32, values=values)
+    rollout = Rollout(T, B, OBS, MOVES, state, device, privileged, values=values)
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape):
