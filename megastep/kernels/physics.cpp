@@ -25,22 +25,7 @@ static float sweep_walls(const float* walls, int n, unsigned char* meets, float 
     return contact;
 }
 
-// Writes the free fraction of agent i's step. `first` is the first agent of its environment.
-static void sweep(const PhysicsParams& p, int first, int i, const float* walls, int n,
-                  unsigned char* meets) {
-    float rho = p.scenery.radius * INFLATION;
-    float px = p.positions[2 * i], py = p.positions[2 * i + 1];
-    float dx = displacement(px, p.velocity[2 * i], p.seconds);
-    float dy = displacement(py, p.velocity[2 * i + 1], p.seconds);
-    float contact = sweep_walls(walls, n, meets, px, py, dx, dy, rho);
-    for (int k = first; k < first + p.scenery.n_agents; k++)
-        if (k != i)
-            contact = minf(contact, sweep_agent(p, k, px, py, dx, dy, rho));
-    int env = first / p.scenery.n_agents, n_objects = p.objects.n_objects;
-    for (int k = env * n_objects; k < (env + 1) * n_objects; k++)
-        contact = minf(contact, sweep_object(p.objects, k, px, py, dx, dy, rho));
-    p.progress[i] = progress_of(contact);
-}
+static float least(const SingleThread&, float contact) { return contact; }
 
 static void step(const PhysicsParams& p, int env, std::vector<unsigned char>& meets) {
     const SceneryParams& s = p.scenery;
@@ -56,7 +41,10 @@ static void step(const PhysicsParams& p, int env, std::vector<unsigned char>& me
         for (int a = 0; a < n_agents; a++)
             apply_controls(p, env, env * n_agents + a);
     for (int a = 0; a < n_agents; a++)
-        sweep(p, env * n_agents, env * n_agents + a, walls, n_walls, meets.data());
+        sweep<1>(p, SingleThread{0}, env, a,
+                 [&](float px, float py, float dx, float dy, float rho) {
+                     return sweep_walls(walls, n_walls, meets.data(), px, py, dx, dy, rho);
+                 });
     for (int a = 0; a < n_agents; a++)
         advance(p, env, a);
 }

@@ -7,10 +7,10 @@
 // are many.
 #include "physics.h"
 
-// `size` neighbouring threads of a warp; this one is number `rank`. The group starts at warp lane
+// SIZE neighbouring threads of a warp; this one is number `rank`. The group starts at warp lane
 // `first`, and `mask` has a bit for each of its warp lanes.
 struct ThreadGroup {
-    int size, rank, first;
+    int SIZE, rank, first;
     unsigned int mask;
 };
 
@@ -25,7 +25,7 @@ DEVICE ThreadGroup group_of(int size) {
 DEVICE float sweep_walls(const SceneryParams& s, const ThreadGroup& group, const Walls& walls,
                          float px, float py, float dx, float dy, float rho) {
     float contact = NO_CONTACT;
-    for (int start = walls.first_box; start < walls.end_box; start += group.size) {
+    for (int start = walls.first_box; start < walls.end_box; start += group.SIZE) {
         int meets = 0;
         if (start + group.rank < walls.end_box && (dx != 0.f || dy != 0.f)) {
             float4 box = ((const float4*)s.boxes)[start + group.rank];
@@ -35,7 +35,7 @@ DEVICE float sweep_walls(const SceneryParams& s, const ThreadGroup& group, const
         for (; boxes; boxes &= boxes - 1) {
             int first = walls.first_wall + BOX_WALLS * (start - walls.first_box + __ffs(boxes) - 1);
             int end = mini(first + BOX_WALLS, walls.end_wall);
-            for (int j = first + group.rank; j < end; j += group.size) {
+            for (int j = first + group.rank; j < end; j += group.SIZE) {
                 float4 wall = ((const float4*)s.walls)[j];
                 contact = minf(contact,
                                sweep_segment(px, py, dx, dy, wall.x, wall.y, wall.z, wall.w, rho));
@@ -45,27 +45,10 @@ DEVICE float sweep_walls(const SceneryParams& s, const ThreadGroup& group, const
     return contact;
 }
 
-// Writes the free fraction of agent a's step.
-template <int with_objects>
-DEVICE void sweep(const PhysicsParams& p, const ThreadGroup& group, int env, const Walls& walls,
-                  float rho, int a) {
-    int n_agents = p.scenery.n_agents;
-    int i = env * n_agents + a;
-    float px = p.positions[2 * i], py = p.positions[2 * i + 1];
-    float dx = displacement(px, p.velocity[2 * i], p.seconds);
-    float dy = displacement(py, p.velocity[2 * i + 1], p.seconds);
-    float contact = sweep_walls(p.scenery, group, walls, px, py, dx, dy, rho);
-    for (int other = group.rank; other < n_agents; other += group.size)
-        if (other != a)
-            contact = minf(contact, sweep_agent(p, env * n_agents + other, px, py, dx, dy, rho));
-    if (with_objects)
-        for (int k = group.rank; k < p.objects.n_objects; k += group.size)
-            contact = minf(contact, sweep_object(p.objects, env * p.objects.n_objects + k, px, py,
-                                                 dx, dy, rho));
-    for (int step = group.size / 2; step; step /= 2)
+DEVICE float least(const ThreadGroup& group, float contact) {
+    for (int step = group.SIZE / 2; step; step /= 2)
         contact = minf(contact, __shfl_xor_sync(group.mask, contact, step));
-    if (group.rank == 0)
-        p.progress[i] = progress_of(contact);
+    return contact;
 }
 
 template <int with_objects>
@@ -76,21 +59,23 @@ DEVICE void move_agents(const PhysicsParams& p) {
         return;
     ThreadGroup group = group_of(p.threads_per_env);
     if (with_objects)
-        for (int k = group.rank; k < p.objects.n_objects; k += group.size)
+        for (int k = group.rank; k < p.objects.n_objects; k += group.SIZE)
             PREFETCH(objects_of(p.objects) + env * p.objects.n_objects + k);
     if (p.actions)
-        for (int a = group.rank; a < n_agents; a += group.size)
+        for (int a = group.rank; a < n_agents; a += group.SIZE)
             apply_action(p, env, env * n_agents + a);
     if (p.controls)
-        for (int a = group.rank; a < n_agents; a += group.size)
+        for (int a = group.rank; a < n_agents; a += group.SIZE)
             apply_controls(p, env, env * n_agents + a);
     __syncwarp(group.mask);
     Walls walls = walls_of(p.scenery, layout_of(p.scenery, env, p.error_flag));
-    float rho = p.scenery.radius * INFLATION;
+    auto of_walls = [&](float px, float py, float dx, float dy, float rho) {
+        return sweep_walls(p.scenery, group, walls, px, py, dx, dy, rho);
+    };
     for (int a = 0; a < n_agents; a++)
-        sweep<with_objects>(p, group, env, walls, rho, a);
+        sweep<with_objects>(p, group, env, a, of_walls);
     __syncwarp(group.mask);
-    for (int a = group.rank; a < n_agents; a += group.size)
+    for (int a = group.rank; a < n_agents; a += group.SIZE)
         advance(p, env, a);
 }
 

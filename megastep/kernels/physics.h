@@ -2,6 +2,7 @@
 // another agent's disc.
 #pragma once
 #include "common/collision.h"
+#include "common/group.h"
 #include "params.h"
 
 constexpr float INFLATION = 1.001f;  // of the radius: a stopped camera stays on its side of a wall
@@ -36,8 +37,27 @@ HD float sweep_object(const ObjectsParams& o, int i, float px, float py, float d
     return contact;
 }
 
-HD float progress_of(float contact) {
-    return contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f;
+// Writes the free fraction of agent a's step. The threads of `group` divide the walls, agents and
+// objects among them. `sweep_walls` returns the earliest contact with walls of an agent at p that
+// moves by d, as sweep_walls(px, py, dx, dy, rho).
+template <int with_objects, class Group, class SweepWalls>
+HD void sweep(const PhysicsParams& p, const Group& group, int env, int a, SweepWalls sweep_walls) {
+    int n_agents = p.scenery.n_agents, n_objects = p.objects.n_objects, i = env * n_agents + a;
+    float rho = p.scenery.radius * INFLATION;
+    float px = p.positions[2 * i], py = p.positions[2 * i + 1];
+    float dx = displacement(px, p.velocity[2 * i], p.seconds);
+    float dy = displacement(py, p.velocity[2 * i + 1], p.seconds);
+    float contact = sweep_walls(px, py, dx, dy, rho);
+    for (int other = group.rank; other < n_agents; other += group.SIZE)
+        if (other != a)
+            contact = minf(contact, sweep_agent(p, env * n_agents + other, px, py, dx, dy, rho));
+    if (with_objects)
+        for (int k = group.rank; k < n_objects; k += group.SIZE)
+            contact =
+                minf(contact, sweep_object(p.objects, env * n_objects + k, px, py, dx, dy, rho));
+    contact = least(group, contact);
+    if (group.rank == 0)
+        p.progress[i] = contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f;
 }
 
 // Damps agent i's velocities and adds a move, rotated to the agent's heading.

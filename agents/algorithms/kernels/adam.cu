@@ -1,6 +1,7 @@
 // Adam with decoupled weight decay for many parameters in one launch, the norm of their gradients,
 // and whether a step is taken. A block handles neighbouring numbers of one parameter, a thread a
 // word of four.
+#include "common/numbers.h"
 #include "common/rows.h"
 #include "common/sums.h"
 #include "params.h"
@@ -21,24 +22,16 @@ DEVICE WordIndex find_index(const AdamRowParams* rows, int n_rows) {
     return {row, at, n, its.is_aligned && n == 4};
 }
 
-DEVICE void read(float (&values)[4], const float* array, const WordIndex& index) {
-    if (index.is_word) {
-        float4 word = *(const float4*)(array + index.first);
-        values[0] = word.x;
-        values[1] = word.y;
-        values[2] = word.z;
-        values[3] = word.w;
-        return;
-    }
+DEVICE void read_word(float (&values)[4], const float* array, const WordIndex& index) {
+    if (index.is_word)
+        return read<float>(values, array, index.first);
     for (int i = 0; i < 4; i++)
         values[i] = i < index.n ? array[index.first + i] : 0.f;
 }
 
-DEVICE void write(float* array, const WordIndex& index, const float (&values)[4]) {
-    if (index.is_word) {
-        *(float4*)(array + index.first) = make_float4(values[0], values[1], values[2], values[3]);
-        return;
-    }
+DEVICE void write_word(float* array, const WordIndex& index, const float (&values)[4]) {
+    if (index.is_word)
+        return write<float>(array, index.first, values);
     for (int i = 0; i < 4; i++)
         if (i < index.n)
             array[index.first + i] = values[i];
@@ -48,7 +41,7 @@ KERNEL __launch_bounds__(256) squared_norm(SquaredNormParams p) {
     wait_for_previous();
     WordIndex index = find_index(p.rows, p.n_rows);
     float values[4], sum[1] = {};
-    read(values, p.rows[index.row].gradient, index);
+    read_word(values, p.rows[index.row].gradient, index);
     for (int i = 0; i < 4; i++)
         sum[0] += values[i] * values[i];
     add_up<ADAM_THREADS>(sum, p.sums + p.first_sum + blockIdx.x);
@@ -91,10 +84,10 @@ KERNEL __launch_bounds__(256) adam(AdamParams p) {
     WordIndex index = find_index(p.rows, p.n_rows);
     const AdamRowParams& row = p.rows[index.row];
     float gradients[4], means[4], squares[4], parameters[4];
-    read(gradients, row.gradient, index);
-    read(means, row.mean, index);
-    read(squares, row.square, index);
-    read(parameters, row.parameter, index);
+    read_word(gradients, row.gradient, index);
+    read_word(means, row.mean, index);
+    read_word(squares, row.square, index);
+    read_word(parameters, row.parameter, index);
     float clip = fminf(p.max_norm / (*p.grad_norm + 1e-6f), 1.f);
     float lr = *p.lr * row.lr_factor, n_steps = *p.n_steps;
     float step = lr / (1.f - powf(p.beta1, n_steps));
@@ -106,7 +99,7 @@ KERNEL __launch_bounds__(256) adam(AdamParams p) {
         parameters[i] = parameters[i] * (1.f - lr * row.weight_decay) -
                         step * means[i] / (sqrtf(squares[i]) * scale + p.eps);
     }
-    write(row.mean, index, means);
-    write(row.square, index, squares);
-    write(row.parameter, index, parameters);
+    write_word(row.mean, index, means);
+    write_word(row.square, index, squares);
+    write_word(row.parameter, index, parameters);
 }

@@ -1,12 +1,6 @@
 // Looks for numbers of a rollout that are NaN, infinite or too large.
-#include "common/half.h"
+#include "common/numbers.h"
 #include "params.h"
-
-DEVICE float value_at(const CheckedTensorParams& tensor, long long at) {
-    if (!tensor.is_half)
-        return ((const float*)tensor.values)[at];
-    return half_value(((const unsigned short*)tensor.values)[at]);
-}
 
 // Whether a word has a bad number: two float16 or one float32. A float16 is bad if all bits of its
 // exponent are set, because its largest finite number is below any limit.
@@ -52,7 +46,7 @@ KERNEL __launch_bounds__(256) find_bad(FindBadParams p) {
         if (!found && !is_end)
             continue;
         for (long long at = first; at < min(first + per_word, n_numbers); at++)
-            if (!(fabsf(value_at(tensor, at)) <= p.limit))
+            if (!(fabsf(number_at(tensor, at)) <= p.limit))
                 keep(p, i, at);
     }
 }
@@ -62,7 +56,7 @@ KERNEL __launch_bounds__(256) find_bad(FindBadParams p) {
 DEVICE float size_of(const CheckedTensorParams& tensor, long long row) {
     float size = 0.f;
     for (int i = 0; i < tensor.n_features; i++) {
-        float value = value_at(tensor, row * tensor.n_features + i);
+        float value = number_at(tensor, row * tensor.n_features + i);
         if (tensor.is_half)
             size += value;
         else

@@ -11,27 +11,21 @@ KERNEL __launch_bounds__(256) bias_gradient(BiasGradientParams p) {
     int word = first_word + strip.word;
     float sums[N];
     clear(sums);
-    for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
-        float values[AT_ONCE][N], activated[AT_ONCE][N];
-        for (int i = 0; i < AT_ONCE; i++) {
-            long long row = min(start + i * strip.step, strip.end - 1);
-            read<Bfloat16>(values[i], p.d, row * p.d_stride + word * N);
-            if (p.activated)
-                read<Bfloat16>(activated[i], p.activated, row * p.n_columns + word * N);
-        }
-        for (int i = 0; i < AT_ONCE; i++) {
-            long long row = start + i * strip.step;
-            if (row >= strip.end)
-                break;
-            if (p.activated) {
-                for (int n = 0; n < N; n++)
-                    values[i][n] = activated[i][n] <= 0.f ? 0.f : values[i][n];
-                write<Bfloat16>(p.d_masked, row * p.n_columns + word * N, values[i]);
-            }
+    float values[AT_ONCE][N], activated[AT_ONCE][N];
+    auto load = [&](int i, long long row) {
+        read<Bfloat16>(values[i], p.d, row * p.d_stride + word * N);
+        if (p.activated)
+            read<Bfloat16>(activated[i], p.activated, row * p.n_columns + word * N);
+    };
+    for_rows(strip, load, [&](int i, long long row) {
+        if (p.activated) {
             for (int n = 0; n < N; n++)
-                sums[n] += values[i][n];
+                values[i][n] = activated[i][n] <= 0.f ? 0.f : values[i][n];
+            write<Bfloat16>(p.d_masked, row * p.n_columns + word * N, values[i]);
         }
-    }
+        for (int n = 0; n < N; n++)
+            sums[n] += values[i][n];
+    });
     float* target = p.sums + blockIdx.x * (long long)p.n_columns + N * first_word;
     add_up(sums, strip, target, strip.words * N);
 }

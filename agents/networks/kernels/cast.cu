@@ -1,7 +1,7 @@
 // Rounds weights to bfloat16, many in one launch, with zeros after each. A thread writes a word of
 // eight numbers.
 #include "common/rows.h"
-#include "number.h"
+#include "common/numbers.h"
 #include "params.h"
 
 KERNEL __launch_bounds__(256) cast(CastParams p) {
@@ -12,12 +12,9 @@ KERNEL __launch_bounds__(256) cast(CastParams p) {
         return;
     const float* source = its.source + at;
     float values[8];
-    if (at + 8 <= its.n && (unsigned long long)source % 16 == 0) {
-        uint4 low = *(const uint4*)source, high = *(const uint4*)(source + 4);
-        const unsigned int words[8] = {low.x, low.y, low.z, low.w, high.x, high.y, high.z, high.w};
-        for (int i = 0; i < 8; i++)
-            values[i] = __uint_as_float(words[i]);
-    } else
+    if (at + 8 <= its.n && (unsigned long long)source % 16 == 0)
+        read_eight(values, source);
+    else
         for (int i = 0; i < 8; i++)
             values[i] = at + i < its.n ? source[i] : 0.f;
     write<Bfloat16>(its.target, at, values);

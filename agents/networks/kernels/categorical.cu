@@ -1,6 +1,6 @@
 // Choosing categorical actions, ACT_THREADS threads per lane.
 #include "common/sums.h"
-#include "number.h"
+#include "common/numbers.h"
 #include "params.h"
 
 template <class T>

@@ -1,7 +1,7 @@
 // Action values of a duelling network from its hidden layer (features of the value, then those of
 // the advantages), their gradients, and epsilon-greedy actions. An agent's value is the lane's
 // value plus its advantage minus the mean over the choices.
-#include "number.h"
+#include "common/numbers.h"
 #include "params.h"
 
 constexpr int OUTPUTS = DUELLING_OUTPUTS;   // at most, A n

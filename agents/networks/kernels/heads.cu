@@ -148,35 +148,27 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
         bool is_score = column >= index.first_score;
         float sums[WORD];
         clear(sums);
-        for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
-            float values[AT_ONCE][WORD], expected[AT_ONCE][WORD], d_errors[AT_ONCE];
-            for (int i = 0; i < AT_ONCE; i++) {
-                long long row = min(start + i * strip.step, strip.end - 1);
-                long long at = row * index.n_columns + column;
-                read<Bfloat16>(values[i], is_score ? p.d_product : p.product, at);
-                // a score has no target: reads whatever is in the first columns
-                int target = is_score ? 0 : column;
-                if (index.first_score)
-                    read<Bfloat16>(expected[i], p.target, row * index.first_score + target);
-                d_errors[i] =
-                    index.first_score ? p.d_errors[row] * 2.f / (float)p.n_predicted : 0.f;
-            }
-            for (int i = 0; i < AT_ONCE; i++) {
-                int row = start + i * strip.step;
-                if (row >= strip.end)
-                    break;
-                if (!is_score) {
-                    for (int n = 0; n < WORD; n++) {
-                        float d = d_errors[i] * (values[i][n] - expected[i][n]);
-                        values[i][n] = column + n < p.n_predicted ? d : 0.f;
-                    }
-                    write<Bfloat16>(p.d_product, (long long)row * index.n_columns + column,
-                                    values[i]);
+        float values[AT_ONCE][WORD], expected[AT_ONCE][WORD], d_errors[AT_ONCE];
+        auto load = [&](int i, long long row) {
+            read<Bfloat16>(values[i], is_score ? p.d_product : p.product,
+                           row * index.n_columns + column);
+            // a score has no target: reads whatever is in the first columns
+            int target = is_score ? 0 : column;
+            if (index.first_score)
+                read<Bfloat16>(expected[i], p.target, row * index.first_score + target);
+            d_errors[i] = index.first_score ? p.d_errors[row] * 2.f / (float)p.n_predicted : 0.f;
+        };
+        for_rows(strip, load, [&](int i, int row) {
+            if (!is_score) {
+                for (int n = 0; n < WORD; n++) {
+                    float d = d_errors[i] * (values[i][n] - expected[i][n]);
+                    values[i][n] = column + n < p.n_predicted ? d : 0.f;
                 }
-                for (int n = 0; n < WORD; n++)
-                    sums[n] += values[i][n];
+                write<Bfloat16>(p.d_product, (long long)row * index.n_columns + column, values[i]);
             }
-        }
+            for (int n = 0; n < WORD; n++)
+                sums[n] += values[i][n];
+        });
         add_up(sums, strip, index.sums + WORD * first_word, WORD * strip.words);
     }
 }
@@ -192,30 +184,22 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     clear(weight_sums);
     clear(bias_sum);
     float scale = *p.value_scale;
-    for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
-        float hidden[AT_ONCE][WORD], d_values[AT_ONCE];
-        for (int i = 0; i < AT_ONCE; i++) {
-            long long row = min(start + i * strip.step, strip.end - 1);
-            read<Bfloat16>(hidden[i], p.product,
-                           row * index.n_columns + index.first_hidden + column);
-            d_values[i] = p.d_values[row] * scale;
+    float hidden[AT_ONCE][WORD], d_values[AT_ONCE];
+    auto load = [&](int i, long long row) {
+        read<Bfloat16>(hidden[i], p.product, row * index.n_columns + index.first_hidden + column);
+        d_values[i] = p.d_values[row] * scale;
+    };
+    for_rows(strip, load, [&](int i, int row) {
+        bias_sum[0] += d_values[i];
+        for (int n = 0; n < WORD; n++) {
+            bool is_off = is_cleared(hidden[i][n], p.value_weight);
+            weight_sums[n] += is_off ? 0.f : d_values[i] * hidden[i][n];
+            hidden[i][n] = is_off ? 0.f : d_values[i] * weight[n];
+            sums[n] += hidden[i][n];
         }
-        for (int i = 0; i < AT_ONCE; i++) {
-            int row = start + i * strip.step;
-            if (row >= strip.end)
-                break;
-            bias_sum[0] += d_values[i];
-            for (int n = 0; n < WORD; n++) {
-                bool is_off = is_cleared(hidden[i][n], p.value_weight);
-                weight_sums[n] += is_off ? 0.f : d_values[i] * hidden[i][n];
-                hidden[i][n] = is_off ? 0.f : d_values[i] * weight[n];
-                sums[n] += hidden[i][n];
-            }
-            write<Bfloat16>(p.d_product,
-                            (long long)row * index.n_columns + index.first_hidden + column,
-                            hidden[i]);
-        }
-    }
+        write<Bfloat16>(p.d_product, (long long)row * index.n_columns + index.first_hidden + column,
+                        hidden[i]);
+    });
     float* target = index.sums + WORD * first_word;
     add_up(sums, strip, target + index.first_hidden, WORD * strip.words);
     if (!p.value_weight)

@@ -6,7 +6,7 @@
 // that steps do not wait for GPU memory. Loads have no conditions and come last in a step:
 // otherwise the compiler would copy what they load, and so wait for it. The last steps' loads are
 // not used.
-#include "number.h"
+#include "common/numbers.h"
 #include "params.h"
 
 constexpr int STEPS_AHEAD = 4;

@@ -3,12 +3,6 @@
 #include "common/sums.h"
 #include "params.h"
 
-DEVICE float number_at(const IntakeLeafParams& leaf, long long at) {
-    if (!leaf.is_half)
-        return ((const float*)leaf.values)[at];
-    return half_value(((const unsigned short*)leaf.values)[at]);
-}
-
 DEVICE void add(float& sum, float x, float mean, bool is_square) {
     sum += is_square ? (x - mean) * (x - mean) : x;
 }
@@ -67,6 +61,11 @@ KERNEL __launch_bounds__(256) moments(MomentsParams p) {
     part[2] = __fdiv_rn(squares, group);
 }
 
+// Of old numbers and, in this fraction, of new ones, whose mean is so far away.
+DEVICE float variance_of(float old, float added, float away, float rate) {
+    return old + rate * (added - old) + rate * (1.f - rate) * away * away;
+}
+
 // Changes nothing if no lane was counted, if moments do not count, or if a number is not finite.
 KERNEL __launch_bounds__(1024) add_moments(AddMomentsParams p) {
     wait_for_previous();
@@ -80,8 +79,7 @@ KERNEL __launch_bounds__(1024) add_moments(AddMomentsParams p) {
             float old_mean = norm.mean[i], old_scale = norm.scale[i];
             float away = norm.new_mean[i] - old_mean;
             float old_variance = old_scale < UNKNOWN_SCALE ? old_scale * old_scale : 0.f;
-            float variance = old_variance + rate * (norm.new_variance[i] - old_variance) +
-                             rate * (1.f - rate) * away * away;
+            float variance = variance_of(old_variance, norm.new_variance[i], away, rate);
             float mean = old_mean + rate * away;
             float scale = sqrtf(variance);
             scale = scale <= RESOLUTION * fabsf(mean) ? UNKNOWN_SCALE : scale;  // NaN stays
@@ -161,8 +159,7 @@ KERNEL __launch_bounds__(256) add_returns(AddReturnsParams p) {
     float old_mean = *p.mean, old_scale = *p.scale, count = *p.count + 1.f;
     float rate = fminf(fmaxf(__fdiv_rn(1.f, count), p.min_rate), 1.f);
     float away = *p.new_mean - old_mean, old_variance = old_scale * old_scale;
-    float variance =
-        old_variance + rate * (*p.new_variance - old_variance) + rate * (1.f - rate) * away * away;
+    float variance = variance_of(old_variance, *p.new_variance, away, rate);
     float mean = old_mean + rate * away, scale = sqrtf(variance);
     bool is_nothing = count == 1.f && scale == 0.f && mean == 0.f;
     float min_scale = fmaxf(p.min_scale, RESOLUTION * fabsf(mean));

@@ -1,6 +1,6 @@
 // The intake of observations: normalises all leaves, selects lanes, concatenates, rounds. A thread
 // handles four columns of several rows, so that it reads their statistics once.
-#include "number.h"
+#include "common/numbers.h"
 #include "params.h"
 
 DEVICE void unpack(float (&values)[4], uint2 word) {
@@ -18,31 +18,16 @@ DEVICE void unpack(float (&values)[4], uint4 word) {
 }
 
 // Where a feature is: its leaf, and its number in it. Features beyond the leaves have number -1.
-struct Feature {
-    const char* values;
-    const float *mean, *scale;
-    int n_features, group, is_half, number;
+struct Feature : IntakeLeafParams {
+    int number;
 };
 
 DEVICE Feature find(const NormaliseParams& p, int number) {
-    Feature feature = {(const char*)p.leaves[0].values,
-                       p.leaves[0].mean,
-                       p.leaves[0].scale,
-                       p.leaves[0].n_features,
-                       p.leaves[0].group,
-                       p.leaves[0].is_half,
-                       -1};
+    Feature feature = {p.leaves[0], -1};
     for (int i = 0; i < MAX_LEAVES; i++) {
-        const IntakeLeafParams& leaf = p.leaves[i];
-        if (number >= 0 && number < leaf.n_features)
-            feature = {(const char*)leaf.values,
-                       leaf.mean,
-                       leaf.scale,
-                       leaf.n_features,
-                       leaf.group,
-                       leaf.is_half,
-                       number};
-        number -= leaf.n_features;
+        if (number >= 0 && number < p.leaves[i].n_features)
+            feature = {p.leaves[i], number};
+        number -= p.leaves[i].n_features;
     }
     return feature;
 }

@@ -2,7 +2,7 @@
 // handles one word of N columns in several rows. A block handles at most 32 words at once, and a
 // warp as many rows at once as it has threads for.
 #pragma once
-#include "number.h"
+#include "common/numbers.h"
 #include "params.h"
 
 constexpr int STRIP_WARPS = STRIP_THREADS / WARP;
@@ -23,6 +23,22 @@ DEVICE Strip find_strip(int strip, int words, int n_rows) {
     // the last threads of a warp may be in no group
     int start = group < groups ? first + warp * groups + group : end;
     return {words, groups, lane % words, start, end, STRIP_WARPS * groups};
+}
+
+// Calls load(i, row) for AT_ONCE rows of the thread, the last one again if there are fewer, and
+// then use(i, row) for those that exist, until all were.
+template <class Load, class Use>
+DEVICE void for_rows(const Strip& strip, Load load, Use use) {
+    for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
+        for (int i = 0; i < AT_ONCE; i++)
+            load(i, (long long)min(start + i * strip.step, strip.end - 1));
+        for (int i = 0; i < AT_ONCE; i++) {
+            int row = start + i * strip.step;
+            if (row >= strip.end)
+                break;
+            use(i, row);
+        }
+    }
 }
 
 // Adds up all threads' sums and writes the first n_columns. All threads of the block take part.

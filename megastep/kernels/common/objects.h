@@ -88,7 +88,8 @@ HD int is_obstacle(const Object& object) {
 }
 
 // A line with these ends at a size of 1, of an object of this size at a pose. Written with sums
-// alone, as update_line.
+// alone: GCC 12, when it vectorises a sum beside a difference, fuses them with the products in
+// spite of -ffp-contract=off.
 HD Float4 line_at(const Float4& ends, float size, const Pose& pose) {
     float ax = ends.x * size, ay = ends.y * size, bx = ends.z * size, by = ends.w * size;
     float minus_sine = -pose.sine;

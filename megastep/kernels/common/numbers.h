@@ -14,6 +14,14 @@ DEVICE float to_float(Bfloat16 x) { return __uint_as_float((unsigned int)x.bits 
 
 DEVICE void assign(float& target, float x) { target = x; }
 
+// Of an array of a struct, float32 or float16.
+template <class Array>
+DEVICE float number_at(const Array& array, long long at) {
+    if (!array.is_half)
+        return ((const float*)array.values)[at];
+    return half_value(((const unsigned short*)array.values)[at]);
+}
+
 // Rounds to nearest, ties to even. NaN is kept apart: rounding up could turn it into infinity.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
 DEVICE void assign(Bfloat16& target, float x) {
