@@ -81,33 +81,29 @@ struct RenderParams : WorldParams {
     ObjectsParams objects;
 };
 
-struct SpawnParams : WorldParams {
-    float* velocity;            // (N, A, 2) as poses, out where mask
-    float* angvelocity;         // (N, A)
-    const unsigned char* mask;  // (N, A) agents that respawn
-    const float* points;        // (D, n_points, 2) spawn points
-    int* counts;                // (N, A) in and out: numbers drawn so far, the generator's counter
-    int* point_index;           // (N, A) out where mask: the layout's point
-    const int* cumulative;      // (D) cumulative weights of the layouts; null: all are as likely
-    unsigned int key0;          // the seed
+struct DrawParams : WorldParams {
+    ObjectsParams objects;
+    const unsigned char* mask;  // what is put elsewhere: (N, A) agents or (N, O) objects
+    const float* points;        // (D, n_points, 2) metres
+    int* counts;        // as mask, in and out: numbers drawn so far, the generator's counter
+    unsigned int key0;  // the seed
     unsigned int key1;
     int n_points;
-    int resample;  // 1: an environment moves to a random layout if all its agents respawn
-    ObjectsParams objects;
+};
+
+struct SpawnParams : DrawParams {
+    float* velocity;        // (N, A, 2) as poses, out where mask
+    float* angvelocity;     // (N, A)
+    int* point_index;       // (N, A) out where mask: the layout's point
+    const int* cumulative;  // (D) cumulative weights of the layouts; null: all are as likely
+    int resample;           // 1: an environment moves to a random layout if all its agents respawn
 };
 
 struct UpdateObjectsParams : WorldParams {
     ObjectsParams objects;
 };
 
-struct PlaceObjectsParams : WorldParams {
-    ObjectsParams objects;
-    const unsigned char* mask;  // (N, O) objects to place
-    const float* points;        // (D, n_points, 2) metres
-    int* counts;                // (N, O) in and out: numbers drawn so far
-    unsigned int key0;          // the seed
-    unsigned int key1;
-    int n_points;
+struct PlaceObjectsParams : DrawParams {
     float apart;  // metres, at least, between what is placed and agents and other objects
 };
 

@@ -81,6 +81,10 @@ DEVICE void load_four(unsigned int (&first)[2], unsigned int (&second)[2], const
     second[1] = parts[3];
 }
 
+DEVICE void load_matrices(unsigned int (&parts)[4], const void* row) {
+    load_rows(parts, row, false);
+}
+
 DEVICE void load_matrices(unsigned int (&first)[2], unsigned int (&second)[2], const void* row) {
     load_four(first, second, row, false);
 }

@@ -23,6 +23,25 @@ struct GameParams : OutcomeParams {
     int only_ended;        // 1: only lanes that `ended` take part
 };
 
+// Of such a game that draws random numbers.
+struct DrawnGameParams : GameParams {
+    int* n_draws;       // (N), or (N, A), in and out: numbers drawn so far, the generator's counter
+    unsigned int key0;  // the seed
+    unsigned int key1;
+};
+
+// Of a game on a board.
+struct BoardParams : OutcomeParams {
+    int* games;                // (fields, N) in and out: the fields of the game's struct, in order
+    const long long* actions;  // (B)
+    int* error_flag;           // (1) out: see common/errors.h
+    unsigned int key0;         // the seed
+    unsigned int key1;
+    int n_envs;     // N
+    int limit;      // steps of an episode
+    int n_threads;  // CPU threads
+};
+
 // Whether a lane takes part in the step.
 HD int takes_part(const GameParams& p, int i) { return !p.only_ended || p.ended[i]; }
 

@@ -61,6 +61,10 @@ DEVICE void load_matrices(unsigned int (&first)[2], unsigned int (&second)[2], c
                  : "memory");
 }
 
+DEVICE void load_matrices(unsigned int (&parts)[4], const void* row) {
+    load_matrices((unsigned int (&)[2])parts[0], (unsigned int (&)[2])parts[2], row);
+}
+
 // Loads two matrices of 8 x 8 bfloat16, transposed.
 DEVICE void load_transposed(unsigned int (&parts)[2], const void* row) {
     unsigned int address = (unsigned int)__cvta_generic_to_shared(row);

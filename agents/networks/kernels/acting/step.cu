@@ -147,14 +147,8 @@ DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& blo
     int right_at = word_at(LANES + block.units + thread / 16 * 8 + thread % 8, thread / 8 % 2);
     for (int k = 0; k < ROW_WORDS; k += 2) {
         unsigned int left[LANE_TILES][4], right[B::GATES][B::UNIT_TILES][2];
-        for (int m = 0; m < LANE_TILES; m++) {
-            unsigned int near[2], far[2];
-            load_matrices(near, far, part + (left_at ^ k * WORD) + 16 * m * ROW_BYTES);
-            left[m][0] = near[0];
-            left[m][1] = near[1];
-            left[m][2] = far[0];
-            left[m][3] = far[1];
-        }
+        for (int m = 0; m < LANE_TILES; m++)
+            load_matrices(left[m], part + (left_at ^ k * WORD) + 16 * m * ROW_BYTES);
         for (int gate = 0; gate < B::GATES; gate++)
             for (int j = 0; j < B::UNIT_TILES; j += 2)
                 load_matrices(right[gate][j], right[gate][j + 1],

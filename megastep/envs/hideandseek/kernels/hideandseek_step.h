@@ -20,28 +20,25 @@ constexpr int PRIVILEGED_PER_BODY = 7;
 // M starts per layout. Positions are written where an episode starts. Metrics: the fraction of the
 // play in which no hider was seen; the furthest that a box was moved by the end of the preparation,
 // and by that of the episode, and likewise how many were locked; the same four of ramps.
-struct HideAndSeekStepParams : GameParams {
+struct HideAndSeekStepParams : DrawnGameParams {
     ObjectsParams objects;
     const long long* actions;  // (N, A) null: none was taken
     const float* starts;       // (D, M, A + K, 2) metres, of agents and bodies
     float* placed;             // (N, K, 2) in and out, as the next: where bodies were at the start
     float* tally;              // (N, TALLY) of the episode so far
-    int* n_draws;              // (N) numbers drawn so far, the generator's counter
     unsigned char* seen;       // (N, A) out: hiders that are seen, seekers that see one
     unsigned char* blind;      // (N, A) out: seekers that wait
     unsigned short* state;     // (N, A, STATE) out: fp16
     float* privileged;         // (N, A, .) for a critic; null: none
-    unsigned int key0;         // the seed
-    unsigned int key1;
-    int n_starts;       // M
-    int n_hiders;       // of the A agents
-    int n_boxes;        // of the K bodies, as the next
-    int n_long;         // elongated boxes
-    int limit;          // steps per episode
-    int prep;           // steps of the preparation
-    float view_cosine;  // of half the field of view
-    float reach;        // metres from an agent's centre to a body that it grabs or locks
-    int grab_elevated;  // 1: elevated agents may grab
+    int n_starts;              // M
+    int n_hiders;              // of the A agents
+    int n_boxes;               // of the K bodies, as the next
+    int n_long;                // elongated boxes
+    int limit;                 // steps per episode
+    int prep;                  // steps of the preparation
+    float view_cosine;         // of half the field of view
+    float reach;               // metres from an agent's centre to a body that it grabs or locks
+    int grab_elevated;         // 1: elevated agents may grab
 };
 
 HD Object* things_of(const HideAndSeekStepParams& p, int env) {

@@ -11,19 +11,16 @@ constexpr int OPEN = -1;  // the state of a doorway without a door
 // N environments of one agent, D layouts, M episodes per layout, C colours, K doorways. Objects are
 // C keys, the goal, then K doors. Positions are written where an episode starts. Metrics: success,
 // doors opened, keys wasted.
-struct KeysStepParams : GameParams {
+struct KeysStepParams : DrawnGameParams {
     ObjectsParams objects;
     const float* starts;       // (D, M, 2) metres
     const float* keys;         // (D, M, C, 2) metres, NaN: no such key
     const float* goals;        // (D, M, 2) metres
     const int* doors;          // (D, M, K) OPEN, a colour, or C, which stays locked
     const float* doorways;     // (D, K, 4) x, y, degrees, half the length
-    int* opened;               // (N) in and out, as the next: doors opened in this episode
-    int* n_draws;              // (N) numbers drawn so far, the generator's counter
+    int* opened;               // (N) in and out: doors opened in this episode
     unsigned short* keys_obs;  // (N, C) fp16: 1 for each key that the agent carries
     float* privileged;         // (N, 2 C + 3) for a critic; null: none
-    unsigned int key0;         // the seed
-    unsigned int key1;
     int n_episodes;            // M
     int n_colours;             // C
     int n_doorways;            // K

@@ -9,20 +9,17 @@
 constexpr int N_GOAL = 4;  // numbers that a critic sees of the object to find
 
 // N environments of one agent, D layouts, O objects. Metric: objects found.
-struct MemoryStepParams : GameParams {
+struct MemoryStepParams : DrawnGameParams {
     ObjectsParams objects;
     const float* arrangements;  // (D, n_arrangements, O, 2) metres: where objects may lie
-    int* cue;                   // (N) in and out, as the next two: the object to find
+    int* cue;                   // (N) in and out, as the next: the object to find
     int* found;                 // (N) objects found in this episode
-    int* n_draws;               // (N) numbers drawn so far, the generator's counter
     unsigned short* cue_obs;    // (N, 3) fp16: the colour of the object to find
     float* goal;                // (N, N_GOAL) for a critic, as the next; null: neither
     float* places;              // (N, O, 2) tens of metres ahead and to the left of the agent
-    unsigned int key0;          // the seed
-    unsigned int key1;
-    int n_arrangements;  // per layout
-    int limit;           // steps per episode
-    float reach;         // metres between surfaces at which an agent touches an object
+    int n_arrangements;         // per layout
+    int limit;                  // steps per episode
+    float reach;                // metres between surfaces at which an agent touches an object
 };
 
 // Returns 1 if the agent of an environment touches its object k.

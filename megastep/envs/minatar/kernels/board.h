@@ -32,23 +32,15 @@ constexpr int LIST_FIELDS = 104;     // of Seaquest's lists: see seaquest.h
 constexpr int FREEWAY_STEPS = 2501;  // of an episode of Freeway, which ends by itself
 
 // N games with C channels.
-struct MinAtarStepParams : OutcomeParams {
-    int* games;                // (fields, N) in and out: the fields of the game, in order
-    int* lists;                // (LIST_FIELDS, N) in and out, of Seaquest; else null
-    const long long* actions;  // (N)
-    unsigned char* image;      // (N, C, SIDE, SIDE) out: 0 or 1
-    int* error_flag;           // (1) out: see common/errors.h
-    unsigned int key0;         // the seed
-    unsigned int key1;
-    unsigned int sticky;  // chance of repeating the last action, in units of 2**-32
-    int n_envs;           // N
-    int n_channels;       // C
-    int game;             // see above
-    int limit;            // steps of an episode
-    int is_ramping;       // whether games become harder
-    int n_actions;        // those above are errors
-    int action_set;       // the original's number of each action, four bits each
-    int n_threads;        // CPU threads
+struct MinAtarStepParams : BoardParams {
+    int* lists;            // (LIST_FIELDS, N) in and out, of Seaquest; else null
+    unsigned char* image;  // (N, C, SIDE, SIDE) out: 0 or 1
+    unsigned int sticky;   // chance of repeating the last action, in units of 2**-32
+    int n_channels;        // C
+    int game;              // see above
+    int is_ramping;        // whether games become harder
+    int n_actions;         // those above are errors
+    int action_set;        // the original's number of each action, four bits each
 };
 
 constexpr int LEFT = 1, UP = 2, RIGHT = 3, DOWN = 4, FIRE = 5;  // as the original numbers them

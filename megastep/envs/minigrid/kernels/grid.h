@@ -41,29 +41,21 @@ constexpr int GO_TO_DOOR = 14;
 constexpr int CUSTOM = 15;
 
 // N games of W x H cells.
-struct MiniGridStepParams : OutcomeParams {
+struct MiniGridStepParams : BoardParams {
     unsigned char* cells;          // (N, H, W) in and out
-    int* games;                    // (GAME_FIELDS, N) in and out: the fields of Game, in order
-    const long long* actions;      // (N)
     unsigned char* image;          // (N, 3, VIEW, VIEW) out, as the next two
     long long* direction;          // (N) 0 right, 1 down, 2 left, 3 up
     float* mission;                // (N, N_MISSION), or null
     const unsigned char* layouts;  // (D, H, W) for CUSTOM, or null
     const int* starts;             // (D, 3): x, y and direction of the agent
-    int* error_flag;               // (1) out: see common/errors.h
-    unsigned int key0;             // the seed
-    unsigned int key1;
-    int n_envs;        // N
-    int width;         // W
-    int height;        // H
-    int limit;         // steps of an episode
-    int task;          // see above
-    int a;             // of the task: see layouts.h; D
-    int b;             // of the task
-    int c;             // of the task
-    int n_actions;     // those above are errors
-    int sees_through;  // whether the agent sees through walls
-    int n_threads;     // CPU threads
+    int width;                     // W
+    int height;                    // H
+    int task;                      // see above
+    int a;                         // of the task: see layouts.h; D
+    int b;                         // of the task
+    int c;                         // of the task
+    int n_actions;                 // those above are errors
+    int sees_through;              // whether the agent sees through walls
 };
 
 constexpr int TURN_LEFT = 0, TURN_RIGHT = 1, FORWARD = 2, PICK_UP = 3, DROP = 4, TOGGLE = 5,

@@ -17,7 +17,7 @@ constexpr int PROGRESS_ROWS = 7;
 constexpr int N_PRIVILEGED = 4;  // numbers that a critic sees
 
 // N environments, A agents per environment, D layouts. Metrics: success, SPL, soft SPL, collisions.
-struct PointgoalStepParams : GameParams {
+struct PointgoalStepParams : DrawnGameParams {
     const float* free;       // (N, A) fraction of the step that was free; null: no step was taken
     const int* spawn_index;  // (N, A) spawn point of the layout, where an episode starts
     const float* points;     // (D, n_goals, 2) the goals
@@ -29,21 +29,18 @@ struct PointgoalStepParams : GameParams {
     const float* lengths;          // (D, n_spawns, n_goals) of the shortest paths
     const int* in_range;       // (D, n_spawns, n_goals) goals; those that may be drawn come first
     const int* n_in_range;     // (D, n_spawns) number of goals that may be drawn
-    int* n_draws;              // (N, A) in and out, as the next two: numbers drawn so far
-    int* goal_index;           // (N, A) the agent's goal, of its layout's
+    int* goal_index;           // (N, A) in and out, as the next: the agent's goal, of its layout's
     float* progress;           // (PROGRESS_ROWS, N, A) see above
     unsigned short* goal_obs;  // (N, A, 3) fp16: distance / 10 m, cosine and sine of the bearing
     float* privileged;         // (N, A, N_PRIVILEGED) for a critic; null: none
-    unsigned int key0;         // the seed
-    unsigned int key1;
-    float per_cell;          // cells per metre
-    float reach;             // metres: success within this distance of the goal
-    const float* bonus;      // (), reward for success
-    const float* cost;       // (), reward subtracted per step
-    const float* walk_cost;  // (), reward subtracted per metre walked
-    int limit;               // steps per episode
-    int n_goals;             // per layout
-    int n_spawns;            // per layout
+    float per_cell;            // cells per metre
+    float reach;               // metres: success within this distance of the goal
+    const float* bonus;        // (), reward for success
+    const float* cost;         // (), reward subtracted per step
+    const float* walk_cost;    // (), reward subtracted per metre walked
+    int limit;                 // steps per episode
+    int n_goals;               // per layout
+    int n_spawns;              // per layout
 };
 
 // Metres to a goal by the shortest path, at the centres of square cells.

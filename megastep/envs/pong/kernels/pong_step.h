@@ -16,20 +16,12 @@ constexpr int GAME_FIELDS = 13;  // of struct Game
 constexpr int N_FEATURES = 8;    // of an observation
 
 // N games, B lanes: B = N sides. Metric: the fraction of a game's points.
-struct PongStepParams : OutcomeParams {
-    int* games;                // (GAME_FIELDS, N) in and out: the fields of Game, in order
-    const long long* actions;  // (B) 0 nothing, 1 up, 2 down; lane = env n_sides + side
+struct PongStepParams : BoardParams {
     unsigned short* features;  // (B, N_FEATURES) fp16, out, as the next; null: none
     unsigned char* pixels;     // (B, ROWS, COLUMNS) null: none
-    int* error_flag;           // (1) out: see common/errors.h
-    unsigned int key0;         // the seed
-    unsigned int key1;
-    int n_envs;         // N
-    int n_sides;        // 2: both paddles act; 1: the left one, against the tracker
-    int points;         // needed to win a game
-    int limit;          // steps per game
-    int tracker_speed;  // per step
-    int n_threads;      // CPU threads
+    int n_sides;               // 2: both paddles act; 1: the left one, against the tracker
+    int points;                // needed to win a game
+    int tracker_speed;         // per step
 };
 
 constexpr int WIDTH = COLUMNS * CELL, HEIGHT = ROWS * CELL;
