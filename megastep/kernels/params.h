@@ -82,13 +82,13 @@ struct RenderParams : WorldParams {
 };
 
 struct DrawParams : WorldParams {
-    ObjectsParams objects;
     const unsigned char* mask;  // what is put elsewhere: (N, A) agents or (N, O) objects
     const float* points;        // (D, n_points, 2) metres
     int* counts;        // as mask, in and out: numbers drawn so far, the generator's counter
     unsigned int key0;  // the seed
     unsigned int key1;
     int n_points;
+    ObjectsParams objects;
 };
 
 struct SpawnParams : DrawParams {

@@ -36,7 +36,6 @@ constexpr int SLOT = 0;
 constexpr int WALL = 1;
 constexpr int OBJECT = 2;
 
-// Motions of all slots.
 struct Motion {
     float x[MAX_SLOTS], y[MAX_SLOTS], turn[MAX_SLOTS];
 };
@@ -208,7 +207,6 @@ HD int elevation_of(const PhysicsBodiesParams& p, const Bodies& b, int env, int 
     return up < 0 && is_over(b, a, n_agents - 1 - up) ? p.ramp_steps : up;
 }
 
-// Returns 1 if an agent that is `elevated` passes a slot.
 HD int passes_slot(int elevated, int slot, int n_agents) {
     return slot >= n_agents && (elevated > 0 || elevated == n_agents - 1 - slot);
 }
@@ -616,7 +614,6 @@ HD void add_load(Bodies& b, int k) {
     b.load_turn[k] += ABS(b.hold[k][2]);
 }
 
-// Solves touches once, in order.
 template <class Group>
 HD void solve_touches(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches,
                       float inv_h, int is_shift) {
@@ -653,7 +650,6 @@ HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n
         add_load(b, k - n_agents);
 }
 
-// Shifts apart what overlaps.
 template <class Group>
 HD void end_overlaps(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches) {
     int n_slots = n_slots_of(p);
@@ -704,7 +700,6 @@ HD void end_body(const PhysicsBodiesParams& p, const Bodies& b, int env, int k) 
     body.turning = b.velocity.turn[slot] * DEGREES;
 }
 
-// Moves all agents and bodies of an environment by a step.
 template <class Group>
 HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int env) {
     int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);

@@ -26,7 +26,6 @@ HD float depth_reading(float distance, float radius, float inv_max_depth) {
     return 1.f - clamp((distance - radius) * inv_max_depth, 0.f, 1.f);
 }
 
-// Object k of an environment, where it is.
 HD Object object_at(const RenderParams& p, int env, int k) {
     const Object& object = objects_of(p.objects)[env * p.objects.n_objects + k];
     return placed(object, p.scenery, p.positions, p.angles, env);

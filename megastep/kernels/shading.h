@@ -80,7 +80,6 @@ HD Hit hit_of(const Surface& line, float y, float length) {
     return hit;
 }
 
-// The cosine between ray and line.
 HD float cosine_of(const Surface& line, float y, float length) {
     float size = SQRT(line.vx * line.vx + line.vy * line.vy);
     return (line.vx + y * line.vy) / (length * size + 1e-6f);

@@ -32,7 +32,6 @@ DEVICE float logit_of(Bfloat16 score, const Softmax& softmax) {
     return to_float(score) - softmax.largest - softmax.log_total;
 }
 
-// Of the n scores of one agent.
 DEVICE Softmax softmax_of(const Bfloat16* scores, int n) {
     Softmax softmax = {to_float(scores[0]), 0.f, 0.f};
     for (int k = 1; k < n; k++)
@@ -106,7 +105,6 @@ KERNEL __launch_bounds__(256) heads_forward(HeadsForwardParams p) {
 
 // ---- Backward ----
 
-// Where a thread reads and writes.
 struct HeadsIndex {
     int strip;
     int first_score, first_hidden, n_columns;

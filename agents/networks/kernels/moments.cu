@@ -37,6 +37,16 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
     return sum_of_block<MASKED_THREADS>(sum);
 }
 
+// Writes the part of this block.
+DEVICE void write_part(float* parts, float count, float mean, float squares) {
+    float* part = parts + 3ll * ((long long)blockIdx.y * gridDim.x + blockIdx.x);
+    if (threadIdx.x)
+        return;
+    part[0] = count;
+    part[1] = mean;
+    part[2] = squares;
+}
+
 // Blocks along x: parts of the lanes; along y: statistics.
 KERNEL __launch_bounds__(256) moments(MomentsParams p) {
     wait_for_previous();
@@ -53,12 +63,7 @@ KERNEL __launch_bounds__(256) moments(MomentsParams p) {
     float n = fmaxf(n_counted, 1.f) * group;
     float mean = __fdiv_rn(sum_of<false>(p, chosen, first, 0.f), n);
     float squares = sum_of<true>(p, chosen, first, mean);
-    if (threadIdx.x)
-        return;
-    float* part = p.parts + 3ll * ((long long)blockIdx.y * gridDim.x + blockIdx.x);
-    part[0] = n_counted;
-    part[1] = mean;
-    part[2] = __fdiv_rn(squares, group);
+    write_part(p.parts, n_counted, mean, __fdiv_rn(squares, group));
 }
 
 // Of old numbers and, in this fraction, of new ones, whose mean is so far away.
@@ -121,12 +126,7 @@ KERNEL __launch_bounds__(256) masked_parts(MaskedPartsParams p) {
         squares += counts[i] ? away * away : 0.f;
     }
     squares = sum_of_block<MASKED_THREADS>(squares);
-    if (threadIdx.x)
-        return;
-    float* part = p.parts + 3ll * ((long long)blockIdx.y * gridDim.x + blockIdx.x);
-    part[0] = count;
-    part[1] = mean;
-    part[2] = squares;
+    write_part(p.parts, count, mean, squares);
 }
 
 // A block adds up the parts of an array (Chan et al. 1979).

@@ -161,7 +161,6 @@ KERNEL policy_add(const PolicyAddParams& p) {
         p.out[i] += p.x[i];
 }
 
-// A number in [0, 1) for one lane, by the generator of megastep.
 static float uniform(const PolicyActParams& p, int lane) {
     return unit_float(philox((unsigned int)(p.first + lane), p.counts[lane]++, p.key0, p.key1).a);
 }

@@ -172,7 +172,6 @@ HD int is_tangent(const Corners& corners, int corner, Point p) {
     return (a * b <= 0.f) | (a * a <= slack2) | (b * b <= slack2);
 }
 
-// Metres along a link.
 HD float link_metres(const HomesParams& p, const Corners& corners, int corner, int other) {
     float straight = distance_between(corner_at(corners, corner), corner_at(corners, other));
     return maxf(straight - p.rebate, 0.f);
@@ -233,7 +232,6 @@ HD float straight_to_goal(const CornerDistancesParams& p, int home, int corner, 
 
 // ---- Points ----
 
-// The home of point i.
 HD int home_of(const PathLengthsParams& p, int i) {
     int low = 0, high = p.homes.n_homes;
     while (high - low > 1) {

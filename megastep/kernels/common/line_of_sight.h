@@ -30,7 +30,6 @@ HD unsigned int cut_by(const Float4& wall, float x, float y, float dx, float dy,
     return cut;
 }
 
-// The lines of sight that environment `env`'s obstacles cut.
 template <class Group>
 HD unsigned int cut_by_objects(const ObjectsParams& o, const Group& group, int env, float x,
                                float y, float dx, float dy, float side_x, float side_y) {

@@ -51,7 +51,6 @@ HD float wrap_degrees(float angle) {
     return wrapped < -180.f ? wrapped + 360.f : wrapped;
 }
 
-// Position and heading of an agent or a camera.
 struct Pose {
     float x, y, sine, cosine;
 };

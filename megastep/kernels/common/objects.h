@@ -62,6 +62,15 @@ HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
 
 HD Body* bodies_of(const ObjectsParams& o) { return (Body*)o.bodies; }
 
+// Those of environment `env`.
+HD Object* objects_of(const ObjectsParams& o, int env) {
+    return objects_of(o) + (long long)env * o.n_objects;
+}
+
+HD Body* bodies_of(const ObjectsParams& o, int env) {
+    return bodies_of(o) + (long long)env * o.n_bodies;
+}
+
 // Stops a body that is put elsewhere, and frees it.
 HD void rest(Body& body) {
     body.vx = body.vy = body.turning = 0.f;
@@ -82,7 +91,6 @@ HD int object_of(const ObjectsParams& o, int l) {
 
 HD int is_there(const Object& object) { return object.visible && !object.open; }
 
-// Returns 1 if an object stops agents.
 HD int is_obstacle(const Object& object) {
     return object.solid && is_there(object) && object.carrier < 0;
 }

@@ -38,7 +38,6 @@ HD int checked(int index, int n, int* error_flag, int env, int kind) {
     return 0;
 }
 
-// The layout that environment `env` shows.
 HD int layout_of(const SceneryParams& s, int env, int* error_flag) {
     return checked(s.layout[env], s.n_layouts, error_flag, env, BAD_LAYOUT);
 }

@@ -42,7 +42,6 @@ struct BoardParams : OutcomeParams {
     int n_threads;  // CPU threads
 };
 
-// Whether a lane takes part in the step.
 HD int takes_part(const GameParams& p, int i) { return !p.only_ended || p.ended[i]; }
 
 // Writes how lane i's step ends: the episode, if it `ends`, by the game's rule or by time.

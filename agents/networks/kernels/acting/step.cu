@@ -123,7 +123,6 @@ DEVICE void begin_states(unsigned char* states, const B& block, const StepParams
                    source + (long long)lane_of(block, lane + i, p) * p.width);
 }
 
-// Sets the sums to the biases.
 template <class B>
 DEVICE void begin_sums(Sums<B>& sums, const B& block, const StepParams& p) {
     const Bits* bias = (const Bits*)p.bias + block.first_unit + block.units + threadIdx.x % 4 * 2;
@@ -137,7 +136,6 @@ DEVICE void begin_sums(Sums<B>& sums, const B& block, const StepParams& p) {
         }
 }
 
-// Adds a part's products.
 template <class B>
 DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& block) {
     int thread = threadIdx.x % 32;

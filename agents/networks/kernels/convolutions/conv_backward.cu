@@ -58,7 +58,6 @@ struct Sums {
     float second_bias[2][4];       // any row x features
 };
 
-// Calls f(sum, index) for each of them.
 template <int R, typename F>
 DEVICE void for_each(Sums<R>& sums, F f) {
     int n = 0;

@@ -36,7 +36,6 @@ DEVICE void begin_rows(Bits* target, const Bits* rows, int first_row, bool is_al
     end_group();
 }
 
-// Writes a tile of features.
 DEVICE void write_features(Bits* features, const Bits* source, int first_row, int n_features,
                            const ConvForwardParams& p) {
     int row = threadIdx.x / ROW_THREADS, part = threadIdx.x % ROW_THREADS;

@@ -56,7 +56,6 @@ DEVICE unsigned int& pair_at(void* array, long long index) {
     return *(unsigned int*)((Bits*)array + index);
 }
 
-// Writes two neighbouring results.
 DEVICE void write_results(const ProductParams& p, int row, int column, float x, float y) {
     if (row >= p.n_rows || column >= p.n_columns)
         return;

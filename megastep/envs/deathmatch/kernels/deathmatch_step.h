@@ -173,7 +173,6 @@ HD void end_round(const DeathmatchStepParams& p, int env) {
     }
 }
 
-// One step of one environment.
 HD void deathmatch_env(const DeathmatchStepParams& p, int env) {
     int first = env * p.n_agents;
     Hits hits;

@@ -77,7 +77,6 @@ HD int band_of(float ahead, float left) {
     return (squared > BAND_ENDS[0] * BAND_ENDS[0]) + (squared > BAND_ENDS[1] * BAND_ENDS[1]);
 }
 
-// The bin of the point (x, y) as seen from `pose`.
 HD int bin_of(const Pose& pose, float x, float y) {
     float dx = x - pose.x, dy = y - pose.y;
     float ahead = pose.cosine * dx + pose.sine * dy, left = pose.cosine * dy - pose.sine * dx;
@@ -86,7 +85,6 @@ HD int bin_of(const Pose& pose, float x, float y) {
 
 // ---- Episodes ----
 
-// An agent's episode.
 struct Episode {
     int reset, newly_seen, age, limit;
 };

@@ -41,14 +41,6 @@ struct HideAndSeekStepParams : DrawnGameParams {
     int grab_elevated;         // 1: elevated agents may grab
 };
 
-HD Object* things_of(const HideAndSeekStepParams& p, int env) {
-    return objects_of(p.objects) + (long long)env * p.objects.n_objects;
-}
-
-HD Body* bodies_in(const HideAndSeekStepParams& p, int env) {
-    return bodies_of(p.objects) + (long long)env * p.objects.n_bodies;
-}
-
 HD Pose pose_of(const HideAndSeekStepParams& p, int i) {
     return pose_at(p.positions[2 * i], p.positions[2 * i + 1], p.angles[i]);
 }
@@ -63,12 +55,12 @@ HD void start_episode(const HideAndSeekStepParams& p, int env, int layout) {
     for (int k = 0; k < n_bodies; k++) {
         const float* at = starts + 2 * (n_agents + k);
         bits = next_draw(p.n_draws, env, p.key0, p.key1);
-        Object& object = things_of(p, env)[k];
+        Object& object = objects_of(p.objects, env)[k];
         object.x = at[0];
         object.y = at[1];
         object.angle = 360.f * unit_float(bits.a) - 180.f;
         object.visible = 1;
-        rest(bodies_in(p, env)[k]);
+        rest(bodies_of(p.objects, env)[k]);
         float* placed = p.placed + 2 * ((long long)env * n_bodies + k);
         placed[0] = at[0];
         placed[1] = at[1];
@@ -111,13 +103,13 @@ HD int is_behind_wall(const HideAndSeekStepParams& p, const Walls& walls, const 
 HD int target_of(const HideAndSeekStepParams& p, const Walls& walls, int env, int a) {
     const ObjectsParams& o = p.objects;
     for (int k = 0; k < o.n_bodies; k++)
-        if (bodies_in(p, env)[k].holder == a)
+        if (bodies_of(p.objects, env)[k].holder == a)
             return k;
     Pose pose = pose_of(p, env * p.scenery.n_agents + a);
     float nearest2 = p.reach * p.reach;
     int target = -1;
     for (int k = 0; k < o.n_bodies; k++) {
-        Float4 to = nearest_point(o, k, things_of(p, env)[k], pose.x, pose.y);
+        Float4 to = nearest_point(o, k, objects_of(p.objects, env)[k], pose.x, pose.y);
         if (!(to.z < nearest2) || !is_in_view(p, pose, to.x, to.y) ||
             is_behind_wall(p, walls, pose, to.x, to.y))
             continue;
@@ -127,7 +119,6 @@ HD int target_of(const HideAndSeekStepParams& p, const Walls& walls, int env, in
     return target;
 }
 
-// Returns 1 if agent i has driven up a ramp.
 HD int is_elevated(const HideAndSeekStepParams& p, int i) {
     return p.objects.elevated && p.objects.elevated[i] > 0;
 }
@@ -137,7 +128,7 @@ HD void use_hand(const HideAndSeekStepParams& p, const Walls& walls, int env, in
     int target = target_of(p, walls, env, a), team = a >= p.n_hiders;
     if (target < 0)
         return;
-    Body& body = bodies_in(p, env)[target];
+    Body& body = bodies_of(p.objects, env)[target];
     int may_grab = p.grab_elevated || !is_elevated(p, env * p.scenery.n_agents + a);
     if (!locks && body.holder == a) {
         body.holder = -1;
@@ -178,11 +169,11 @@ HD unsigned int find_seen(const HideAndSeekStepParams& p, const Group& group, co
 HD void measure(const HideAndSeekStepParams& p, int env, int first, int end, float* out) {
     float furthest2 = 0.f, n_locked = 0.f;
     for (int k = first; k < end; k++) {
-        const Object& object = things_of(p, env)[k];
+        const Object& object = objects_of(p.objects, env)[k];
         const float* placed = p.placed + 2 * ((long long)env * p.objects.n_bodies + k);
         float dx = object.x - placed[0], dy = object.y - placed[1];
         furthest2 = maxf(furthest2, dx * dx + dy * dy);
-        n_locked += (float)bodies_in(p, env)[k].locked;
+        n_locked += (float)bodies_of(p.objects, env)[k].locked;
     }
     out[0] = SQRT(furthest2);
     out[1] = n_locked;
@@ -202,7 +193,7 @@ HD void write_state(const HideAndSeekStepParams& p, const Walls& walls, int env,
     int left = (is_prep ? p.prep : p.limit) - age, of = is_prep ? p.prep : p.limit - p.prep;
     Body body = {};
     if (target >= 0)
-        body = bodies_in(p, env)[target];
+        body = bodies_of(p.objects, env)[target];
     int is_there = target >= 0, holds = is_there && body.holder == a;
     float values[STATE] = {(float)!team,
                            (float)is_prep,
@@ -246,8 +237,8 @@ HD void write_privileged(const HideAndSeekStepParams& p, int env, int a, unsigne
         *out++ = (float)(seen >> b & 1);
     }
     for (int k = 0; k < n_bodies; k++) {
-        const Object& object = things_of(p, env)[k];
-        const Body& body = bodies_in(p, env)[k];
+        const Object& object = objects_of(p.objects, env)[k];
+        const Body& body = bodies_of(p.objects, env)[k];
         out = write_pose(pose, object.x, object.y, object.angle, out);
         *out++ = (float)(body.locked && body.owner == team);
         *out++ = (float)(body.locked && body.owner != team);
@@ -267,7 +258,6 @@ HD void write_metrics(const HideAndSeekStepParams& p, int i, const float* tally,
     }
 }
 
-// One step of one environment.
 template <class Group>
 HD void hideandseek_env(const HideAndSeekStepParams& p, const Group& group, int env) {
     int n_agents = p.scenery.n_agents, first = env * n_agents, reset = p.ended[first];
@@ -309,9 +299,9 @@ HD void hideandseek_env(const HideAndSeekStepParams& p, const Group& group, int 
             write_privileged(p, env, a, seen);
     }
     for (int k = group.rank; k < p.objects.n_bodies; k += Group::SIZE) {
-        const Body& body = bodies_in(p, env)[k];
+        const Body& body = bodies_of(p.objects, env)[k];
         int kind = k < p.n_boxes ? 0 : k < p.n_boxes + p.n_long ? 1 : 2;
-        things_of(p, env)[k].colour = body.locked ? N_KINDS + body.owner : kind;
+        objects_of(p.objects, env)[k].colour = body.locked ? N_KINDS + body.owner : kind;
     }
 }
 
@@ -332,7 +322,6 @@ struct HideAndSeekMovesParams {
     int prep;
 };
 
-// Returns 1 if an action of lane i moves it.
 HD int is_move(const HideAndSeekMovesParams& p, int i) {
     int waits = p.ages[i] < p.prep && i % p.n_agents >= p.n_hiders;
     return !p.ended[i] && !waits && p.actions[i] < GRAB;

@@ -30,10 +30,6 @@ struct KeysStepParams : DrawnGameParams {
     const float* door_reward;  // (), for a door that is opened
 };
 
-HD Object* things_of(const KeysStepParams& p, int env) {
-    return objects_of(p.objects) + env * p.objects.n_objects;
-}
-
 // Returns 1 if an agent at (x, y) touches an object that is there and not carried.
 HD int touches(const KeysStepParams& p, const Object& object, float x, float y, int is_door) {
     if (!is_there(object) || object.carrier >= 0)
@@ -63,7 +59,7 @@ HD void start_episode(const KeysStepParams& p, int env, int layout) {
     Philox bits = next_draw(p.n_draws, env, p.key0, p.key1);
     int drawn = below(bits.a, p.n_episodes), n = p.n_colours;
     long long row = (long long)layout * p.n_episodes + drawn;
-    Object* things = things_of(p, env);
+    Object* things = objects_of(p.objects, env);
     p.positions[2 * env] = p.starts[2 * row];
     p.positions[2 * env + 1] = p.starts[2 * row + 1];
     for (int k = 0; k < n; k++) {
@@ -85,7 +81,7 @@ HD void start_episode(const KeysStepParams& p, int env, int layout) {
 // steps that is left. Keys that do not lie about are at 0. Written with sums alone, which compilers
 // do not fuse.
 HD void write_privileged(const KeysStepParams& p, int env, int age) {
-    const Object* things = things_of(p, env);
+    const Object* things = objects_of(p.objects, env);
     Pose pose = pose_at(p.positions[2 * env], p.positions[2 * env + 1], p.angles[env]);
     float minus_sine = -pose.sine;
     float* out = p.privileged + (2 * p.n_colours + 3) * (long long)env;
@@ -102,7 +98,7 @@ HD void keys_env(const KeysStepParams& p, int env) {
     if (!takes_part(p, env))
         return;
     int reset = p.ended[env], n = p.n_colours, success = 0;
-    Object* things = things_of(p, env);
+    Object* things = objects_of(p.objects, env);
     if (reset)
         start_episode(p, env, layout_of(p.scenery, env, p.error_flag));
     float x = p.positions[2 * env], y = p.positions[2 * env + 1], reward = 0.f;

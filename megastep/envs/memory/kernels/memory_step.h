@@ -22,7 +22,6 @@ struct MemoryStepParams : DrawnGameParams {
     float reach;                // metres between surfaces at which an agent touches an object
 };
 
-// Returns 1 if the agent of an environment touches its object k.
 HD int touches(const MemoryStepParams& p, int env, int k) {
     Object object = objects_of(p.objects)[env * p.objects.n_objects + k];
     float dx = p.positions[2 * env] - object.x, dy = p.positions[2 * env + 1] - object.y;

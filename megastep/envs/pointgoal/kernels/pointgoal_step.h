@@ -118,7 +118,6 @@ HD void write_metrics(const PointgoalStepParams& p, int agent, int n, int ends, 
     p.metrics[3 * rows + agent] = ends ? progress[COLLISIONS * rows] : 0.f;
 }
 
-// One step of one agent.
 HD void pointgoal_agent(const PointgoalStepParams& p, int agent) {
     if (!takes_part(p, agent))
         return;
