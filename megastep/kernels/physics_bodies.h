@@ -258,9 +258,7 @@ HD void leave_out_sleepers(const Group& group, Bodies& b, int n_slots, float rea
         }
         woken = reduce_or(group, wakes);
     }
-    for (int i = group.rank; i < n_slots; i += Group::SIZE)
-        b.exists[i] &= awake >> i & 1;
-    sync(group);
+    each(group, 0, n_slots, [&](int i) { b.exists[i] &= awake >> i & 1; });
 }
 
 // Lists all pairs that may touch while nothing moves further than `reach`. Returns their number.
@@ -632,9 +630,7 @@ HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n
     int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);
     int n_iterations = n_touches || holds ? ITERATIONS : 1;  // one has the floor's impulses
     for (int i = 0; i < n_iterations; i++) {
-        for (int a = group.rank; a < n_agents; a += Group::SIZE)
-            solve_drag(b, a, h);
-        sync(group);
+        each(group, 0, n_agents, [&](int a) { solve_drag(b, a, h); });
         if (holds) {
             if (group.rank == 0)
                 for (int k = 0; k < p.objects.n_bodies; k++)
@@ -642,9 +638,7 @@ HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n
             sync(group);
         }
         solve_touches(p, group, b, n_touches, 1.f / h, 0);
-        for (int k = n_agents + group.rank; k < n_slots; k += Group::SIZE)
-            solve_drag(b, k, h);
-        sync(group);
+        each(group, n_agents, n_slots, [&](int k) { solve_drag(b, k, h); });
     }
     for (int k = n_agents + group.rank; k < n_slots && holds; k += Group::SIZE)
         add_load(b, k - n_agents);
@@ -653,14 +647,10 @@ HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n
 template <class Group>
 HD void end_overlaps(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches) {
     int n_slots = n_slots_of(p);
-    for (int i = group.rank; i < n_slots; i += Group::SIZE)
-        b.shift.x[i] = b.shift.y[i] = b.shift.turn[i] = 0.f;
-    sync(group);
+    each(group, 0, n_slots, [&](int i) { b.shift.x[i] = b.shift.y[i] = b.shift.turn[i] = 0.f; });
     for (int i = 0; i < ITERATIONS; i++)
         solve_touches(p, group, b, n_touches, 1.f, 1);
-    for (int i = group.rank; i < n_slots; i += Group::SIZE)
-        displace(b, i, b.shift, 1.f, MAX_SHIFT);
-    sync(group);
+    each(group, 0, n_slots, [&](int i) { displace(b, i, b.shift, 1.f, MAX_SHIFT); });
 }
 
 // Writes what an agent did, and the fraction of what it wished, as `physics` does.
@@ -703,22 +693,20 @@ HD void end_body(const PhysicsBodiesParams& p, const Bodies& b, int env, int k) 
 template <class Group>
 HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int env) {
     int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);
-    for (int i = group.rank; i < n_slots; i += Group::SIZE) {
+    each(group, 0, n_slots, [&](int i) {
         if (i < n_agents)
             begin_agent(p, b, env, i);
         else
             begin_body(p, b, env, i - n_agents);
         b.hit[i] = b.overlaps[i] = b.elevated[i] = 0;
         b.before[i] = b.hulls[i];
-    }
-    sync(group);
+    });
     if (p.objects.elevated) {
         int* elevated = p.objects.elevated + env * n_agents;
-        for (int a = group.rank; a < n_agents; a += Group::SIZE) {
+        each(group, 0, n_agents, [&](int a) {
             elevated[a] = elevation_of(p, b, env, a);
             b.elevated[a] = mini(elevated[a], 1);
-        }
-        sync(group);
+        });
     }
     unsigned int any = 0;
     for (int k = group.rank; k < n_slots - n_agents; k += Group::SIZE) {
@@ -727,9 +715,7 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
     }
     int holds = reduce_or(group, any) != 0;
     sync(group);
-    for (int i = group.rank; i < n_slots; i += Group::SIZE)
-        b.speeds[i] = top_speed(b, i, n_agents);
-    sync(group);
+    each(group, 0, n_slots, [&](int i) { b.speeds[i] = top_speed(b, i, n_agents); });
     float top = 0.f;
     for (int i = 0; i < n_slots; i++)
         top = maxf(top, b.speeds[i]);
@@ -745,18 +731,16 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
     leave_out_sleepers(group, b, n_slots, SUBSTEPS * reach);
     int n_candidates = find_candidates(p, group, b, env, SUBSTEPS * reach), n_touches;
     sync(group);
-    for (int i = group.rank; i < n_slots; i += Group::SIZE)
+    each(group, 0, n_slots, [&](int i) {
         if (b.overlaps[i]) {  // in a pair that is not listed
             b.inv_mass[i] = b.inv_inertia[i] = 0.f;
             b.velocity.x[i] = b.velocity.y[i] = 0.f;
         }
-    sync(group);
+    });
     for (int substep = 0, checks = 0;;) {
         int is_bad = find_touches(p, group, b, env, n_candidates, reach, checks, n_touches);
         if (checks && is_bad) {  // shifts were not enough
-            for (int i = group.rank; i < n_slots; i += Group::SIZE)
-                take_back(b, i, n_agents);
-            sync(group);
+            each(group, 0, n_slots, [&](int i) { take_back(b, i, n_agents); });
             continue;
         }
         if (is_bad && !checks && substep > 0) {
@@ -768,13 +752,9 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
             break;
         substep++;
         checks = 0;
-        for (int i = group.rank; i < n_slots; i += Group::SIZE)
-            begin_substep(b, i, n_agents);
-        sync(group);
+        each(group, 0, n_slots, [&](int i) { begin_substep(b, i, n_agents); });
         solve(p, group, b, n_touches, h, holds);
-        for (int i = group.rank; i < n_slots; i += Group::SIZE)
-            displace(b, i, b.velocity, h, limit);
-        sync(group);
+        each(group, 0, n_slots, [&](int i) { displace(b, i, b.velocity, h, limit); });
     }
     for (int i = group.rank; i < n_slots; i += Group::SIZE)
         if (i < n_agents)

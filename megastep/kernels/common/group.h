@@ -18,6 +18,14 @@ HD int reduce_min(const SingleThread&, int x) { return x; }
 
 HD int reduce_add(const SingleThread&, int x) { return x; }
 
+// Calls f(i) for each i in [first, end), which the threads of a group divide, and waits for all.
+template <class Group, class F>
+HD void each(const Group& group, int first, int end, F f) {
+    for (int i = first + group.rank; i < end; i += Group::SIZE)
+        f(i);
+    sync(group);
+}
+
 // A bit for each thread of a group, set where `is_set`.
 HD unsigned int ballot(const SingleThread&, int is_set) { return is_set ? 1u : 0u; }
 
