@@ -12,15 +12,17 @@ HD int is_disc(const Hull& hull) { return hull.hy < 0.f; }
 // The radius of the smallest disc around a hull's centre that holds it.
 HD float extent_of(float hx, float hy) { return hy < 0.f ? hx : SQRT(hx * hx + hy * hy); }
 
+HD Hull hull_at(float x, float y, float degrees, float hx, float hy) {
+    Hull hull = {x, y, 0.f, 1.f, hx, hy};
+    sincos_degrees(degrees, hull.sine, hull.cosine);
+    return hull;
+}
+
 HD Hull hull_of(const Float4& wall) {
     float dx = wall.z - wall.x, dy = wall.w - wall.y, length = SQRT(dx * dx + dy * dy);
     float inverse = length > 0.f ? 1.f / length : 0.f;
-    return {0.5f * (wall.x + wall.z),
-            0.5f * (wall.y + wall.w),
-            dy * inverse,
-            dx * inverse,
-            0.5f * length,
-            0.f};
+    float x = 0.5f * (wall.x + wall.z), y = 0.5f * (wall.y + wall.w);
+    return {x, y, dy * inverse, dx * inverse, 0.5f * length, 0.f};
 }
 
 // Half the width of object k, of a size; -1 of a disc. A crate's first line is its lower side.

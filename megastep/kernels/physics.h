@@ -29,7 +29,7 @@ HD float sweep_object(const ObjectsParams& o, int i, float px, float py, float d
         return sweep_point(px - x, py - y, dx, dy, rho + object.size);
     float contact = NO_CONTACT;
     Pose pose = pose_at(x, y, object.angle);
-    Lines lines = lines_of(o, k);
+    Range lines = lines_of(o, k);
     for (int l = lines.first; l < lines.end; l++) {
         Float4 line = line_of(o, l, object, pose);
         contact = minf(contact, sweep_segment(px, py, dx, dy, line.x, line.y, line.z, line.w, rho));

@@ -67,22 +67,15 @@ struct Bodies {
 
 HD int n_slots_of(const PhysicsBodiesParams& p) { return p.scenery.n_agents + p.objects.n_bodies; }
 
-HD void turn_hull(Hull& hull, float degrees) { sincos_degrees(degrees, hull.sine, hull.cosine); }
-
 // Fills in an agent's slot. Its disc is larger than the one that no wall may enter, by what may
 // overlap. Its velocity is the real one; its action changes what it wishes.
 HD void begin_agent(const PhysicsBodiesParams& p, Bodies& b, int env, int a) {
     int i = env * p.scenery.n_agents + a;
-    b.hulls[a] = {p.positions[2 * i],
-                  p.positions[2 * i + 1],
-                  0.f,
-                  1.f,
-                  p.scenery.radius * INFLATION + MAX_OVERLAP,
-                  -1.f};
     b.angles[a] = p.angles[i];
+    b.hulls[a] = hull_at(p.positions[2 * i], p.positions[2 * i + 1], b.angles[a],
+                         p.scenery.radius * INFLATION + MAX_OVERLAP, -1.f);
     b.velocity.x[a] = p.velocity[2 * i];
     b.velocity.y[a] = p.velocity[2 * i + 1];
-    turn_hull(b.hulls[a], b.angles[a]);
     if (p.actions)
         apply_action(p, env, i);
     if (p.controls)
@@ -105,9 +98,8 @@ HD void begin_body(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
     Object object = objects_of(o)[env * o.n_objects + object_index];
     Body body = bodies_of(o)[env * o.n_bodies + k];
     float hy = half_width_of(o, object_index, object.size);
-    b.hulls[slot] = {object.x, object.y, 0.f, 1.f, object.size, hy};
+    b.hulls[slot] = hull_at(object.x, object.y, object.angle, object.size, hy);
     b.angles[slot] = object.angle;
-    turn_hull(b.hulls[slot], object.angle);
     b.exists[slot] = is_obstacle(object) && is_drawn(object);
     b.extent[slot] = extent_of(object.size, hy);
     int moves =
@@ -330,9 +322,8 @@ HD Hull other_hull(const PhysicsBodiesParams& p, const Bodies& b, int env, int c
     }
     const ObjectsParams& o = p.objects;
     Object object = objects_of(o)[env * o.n_objects + index];
-    Hull hull = {object.x, object.y, 0.f, 1.f, object.size, half_width_of(o, index, object.size)};
-    turn_hull(hull, object.angle);
-    return hull;
+    return hull_at(object.x, object.y, object.angle, object.size,
+                   half_width_of(o, index, object.size));
 }
 
 // Returns 1 if the centre of a hull that was at `old` has passed through a wall or a door.
@@ -586,7 +577,7 @@ HD void displace(Bodies& b, int i, const Motion& m, float h, float limit) {
     b.hulls[i].y += h * m.y[i];
     if (m.turn[i] != 0.f) {
         b.angles[i] += h * (m.turn[i] * DEGREES);
-        turn_hull(b.hulls[i], b.angles[i]);
+        sincos_degrees(b.angles[i], b.hulls[i].sine, b.hulls[i].cosine);
     }
 }
 

@@ -8,11 +8,6 @@
 constexpr int TILE = WARP;  // pixels
 static_assert(MAX_RES == TILE * WARP, "warp lane k holds tile_min of tile k");
 
-// The tiles [first, end) of a screen.
-struct Tiles {
-    int first, end;
-};
-
 // One camera's view while it is rasterised. Warp lane k holds tile_min of tile k: the smallest
 // inverse depth among its pixels. `nearest` has whole tiles; pixels beyond the screen have infinite
 // inverse depth, so they are never the smallest. If `is_split`, this warp has only `tiles` of the
@@ -25,14 +20,14 @@ struct View {
     PixelSpan* spans;      // (32) in shared memory: the group's
     NearestLine* nearest;  // (whole tiles) in shared memory
     int warp_lane;
-    Tiles tiles;
+    Range tiles;
     float tile_min;
 };
 
 HD int whole_tiles(int res) { return (res + TILE - 1) & ~(TILE - 1); }
 
 // Half of a screen's tiles for each of two warps.
-HD Tiles half_of_screen(int res, int warp) {
+HD Range half_of_screen(int res, int warp) {
     int n_tiles = whole_tiles(res) / TILE, middle = (n_tiles + 1) / 2;
     return {warp ? middle : 0, warp ? n_tiles : middle};
 }

@@ -355,7 +355,7 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
         if (a == 0)
             settle(p.objects, s, object, layout, env * p.objects.n_objects + k, p.error_flag);
         draw_texel(p, object, env, k, scratch.objects.data());
-        Lines lines = lines_of(p.objects, k);
+        Range lines = lines_of(p.objects, k);
         for (int l = lines.first; l < lines.end; l++)
             scratch.objects[l] = seen_line(p.objects, object, l, a);
     }

@@ -139,7 +139,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     if (seen && p.clear_mask && p.clear_mask[agent])
         for (int i = rank; i < p.n_words; i += n_threads)
             seen[i] = 0u;
-    Tiles tiles = {0, 0};
+    Range tiles = {0, 0};
     if (is_split) {
         tiles = half_of_screen(p.res, warp);
         __syncthreads();  // `seen` is clear

@@ -5,12 +5,12 @@
 #include "common/philox.h"
 #include "params.h"
 
-// The first of agent a's points, counted from `first`, that no placed agent can see. Placed are
-// agents that do not respawn and those that already have. If every point is visible, the one that
-// is furthest from its nearest placed agent. Points on obstacles are left out, unless all are.
-template <int with_objects, class Group>
-HD int hidden_point(const SpawnParams& p, const Group& group, int env, int a, int layout,
-                    int first) {
+// The first of agent a's points, counted from `first`, that is on no obstacle and, if `hidden`,
+// that no placed agent can see. Placed are agents that do not respawn and those that already have.
+// If every point is visible, the one that is furthest from its nearest placed agent; if there is
+// none, the first.
+template <int hidden, int with_objects, class Group>
+HD int point_of(const SpawnParams& p, const Group& group, int env, int a, int layout, int first) {
     int n_agents = p.scenery.n_agents, n_per_agent = p.n_points / n_agents, furthest = first;
     const float* points = p.points + 2 * ((long long)layout * p.n_points + a * n_per_agent);
     Walls walls = walls_of(p.scenery, layout);
@@ -20,6 +20,8 @@ HD int hidden_point(const SpawnParams& p, const Group& group, int env, int a, in
         float x = points[2 * point], y = points[2 * point + 1], nearest2 = INF_VALUE;
         if (with_objects && !is_clear(p.objects, env, x, y, p.scenery.radius))
             continue;
+        if (!hidden)
+            return point;
         for (int b = 0; b < n_agents; b++) {
             int other = env * n_agents + b;
             if (b == a || (b > a && p.mask[other]))
@@ -68,18 +70,6 @@ HD void place(const SpawnParams& p, int i, const float* at, float angle) {
     p.angvelocity[i] = 0.f;
 }
 
-// The first of agent a's points, counted from `first`, that is on no obstacle; `first` if all are.
-HD int clear_point(const SpawnParams& p, int env, int a, int layout, int first) {
-    int n_per_agent = p.n_points / p.scenery.n_agents;
-    const float* points = p.points + 2 * ((long long)layout * p.n_points + a * n_per_agent);
-    for (int k = 0; k < n_per_agent; k++) {
-        int point = (first + k) % n_per_agent;
-        if (is_clear(p.objects, env, points[2 * point], points[2 * point + 1], p.scenery.radius))
-            return point;
-    }
-    return first;
-}
-
 // Has agent a drop what it carries, where it is, and let go of what it holds.
 template <class Group>
 HD void drop_all(const ObjectsParams& o, const Group& group, int env, int a) {
@@ -116,10 +106,8 @@ HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
         if (a == 0 && moves)
             layout = drawn_layout(p, bits.c);
         int point = (int)(unit_float(bits.a) * (float)n_per_agent);
-        if (with_objects && !hidden && !moves)
-            point = clear_point(p, env, a, layout, point);
-        if (hidden)
-            point = hidden_point<with_objects>(p, group, env, a, layout, point);
+        if (hidden || (with_objects && !moves))
+            point = point_of<hidden, with_objects>(p, group, env, a, layout, point);
         sync(group);  // all threads have read what is written now
         if (with_objects)
             drop_all(p.objects, group, env, a);

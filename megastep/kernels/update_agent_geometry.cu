@@ -47,8 +47,6 @@ struct FacingWall {
     float ax, ay, bx, by, limit;
 };
 
-HD FacingWall no_wall() { return {0.f, 0.f, 0.f, 0.f, -INF_VALUE}; }
-
 // The area w x v of a wall v that begins at w from a point tells on which side of the wall the
 // point is. From an agent to a light, it changes by side_b - side_a. There is no limit if the
 // wall's line may cut the agent.
@@ -123,7 +121,7 @@ DEVICE unsigned int unoccluded(const SceneryParams& s, const Pose& pose, const W
         unsigned int near = __ballot_sync(FULL_WARP, overlap(bounds, lights.bounds)) &
                             __reduce_or_sync(FULL_WARP, lit_by);
         int first = walls.first_wall + BOX_WALLS * (box - walls.first_box);
-        FacingWall wall = no_wall();
+        FacingWall wall = {0.f, 0.f, 0.f, 0.f, -INF_VALUE};  // none
         if (near && first + warp_lane < walls.end_wall)
             wall = facing_wall(LOAD((const Float4*)s.walls + (first + warp_lane)), pose, s.reach);
         for (; near; near &= near - 1) {

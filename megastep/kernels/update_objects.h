@@ -14,7 +14,7 @@ HD void update_object(const UpdateObjectsParams& p, int i) {
     Object object = placed(objects_of(o)[i], s, p.positions, p.angles, env);
     settle(o, s, object, layout, i, p.error_flag);
     Float4* lines = (Float4*)o.lines + env * (long long)o.n_lines;
-    Lines own = lines_of(o, k);
+    Range own = lines_of(o, k);
     for (int l = own.first; l < own.end; l++)
         lines[l] = seen_line(o, object, l, NOBODY);
     float light = o.lit && is_drawn(object) ? light_at(s, layout, object.x, object.y) : 1.f;

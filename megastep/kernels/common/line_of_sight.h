@@ -39,7 +39,7 @@ HD unsigned int cut_by_objects(const ObjectsParams& o, const Group& group, int e
         if (!is_obstacle(object))
             continue;
         Pose pose = pose_at(object.x, object.y, object.angle);
-        Lines lines = lines_of(o, k);
+        Range lines = lines_of(o, k);
         for (int l = lines.first; l < lines.end; l++)
             cut |= cut_by(line_of(o, l, object, pose), x, y, dx, dy, side_x, side_y);
     }

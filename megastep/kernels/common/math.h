@@ -21,6 +21,16 @@ HD float cross(float ax, float ay, float bx, float by) { return ax * by - ay * b
 
 HD int is_finite(float x) { return x - x == 0.f; }
 
+// [first, end)
+struct Range {
+    int first, end;
+};
+
+// Where those of owner i begin and end, of n in all.
+HD Range range_of(const int* starts, int i, int n) {
+    return {within(starts[i], n), within(starts[i + 1], n)};
+}
+
 // Four floats, read and written in one instruction.
 struct ALIGNED Float4 {
     float x, y, z, w;

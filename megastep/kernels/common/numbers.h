@@ -36,30 +36,18 @@ DEVICE void assign(Bfloat16& target, float x) {
 }
 #endif
 
-// The type of a word of BYTES bytes, which one instruction moves.
-template <int BYTES>
-struct Word;
-template <>
-struct Word<2> {
-    typedef unsigned short Type;
-};
-template <>
-struct Word<4> {
-    typedef unsigned int Type;
-};
-template <>
-struct Word<8> {
-    typedef uint2 Type;
-};
-template <>
-struct Word<16> {
-    typedef uint4 Type;
-};
+// Their types are those of words of so many bytes, each of which one instruction moves.
+template <int N>
+struct Bytes {};
+__device__ unsigned short word_of(Bytes<2>);
+__device__ unsigned int word_of(Bytes<4>);
+__device__ uint2 word_of(Bytes<8>);
+__device__ uint4 word_of(Bytes<16>);
 
 // N neighbours in one word. Without it, the compiler moves some of them one by one.
 template <class T, int N>
 union Pack {
-    typename Word<N * sizeof(T)>::Type word;
+    decltype(word_of(Bytes<N * sizeof(T)>())) word;
     T values[N];
 };
 

@@ -107,14 +107,8 @@ HD Float4 line_at(const Float4& ends, float size, const Pose& pose) {
             pose.y + (pose.sine * bx + pose.cosine * by)};
 }
 
-// The lines [first, end) of an environment's object k, within those that there are.
-struct Lines {
-    int first, end;
-};
-
-HD Lines lines_of(const ObjectsParams& o, int k) {
-    return {within(o.line_starts[k], o.n_lines), within(o.line_starts[k + 1], o.n_lines)};
-}
+// The lines of an environment's object k.
+HD Range lines_of(const ObjectsParams& o, int k) { return range_of(o.line_starts, k, o.n_lines); }
 
 // Half the diagonal of object k, if it is a body, since bodies never overlap; else its size.
 HD float radius_of(const ObjectsParams& o, int k, float size) {

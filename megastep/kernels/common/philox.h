@@ -20,6 +20,10 @@ HD Philox philox(unsigned int lane, unsigned int draw, unsigned int key0, unsign
     return x;
 }
 
+RARE unsigned int random_word(int lane, int draw, unsigned int key0, unsigned int key1) {
+    return philox((unsigned int)lane, (unsigned int)draw, key0, key1).a;
+}
+
 // A number in [0, 1) from the upper 24 bits, which a float holds exactly.
 HD float unit_float(unsigned int bits) { return (float)(bits >> 8) * (1.f / 16777216.f); }
 

@@ -38,11 +38,12 @@ DEVICE void begin_matrix(Bits* target, const Side& side, int first_inner, int en
     }
 }
 
+typedef unsigned int Pair[2];
+
 // Loads 16 x 16 numbers, from row `outer` and number `inner` of the axis on: four matrices, first
 // along the inner axis if `is_right`, else along the outer one.
 template <bool is_transposed, bool is_right>
-DEVICE void load_square(unsigned int (&near)[2], unsigned int (&far)[2], const Bits* matrix,
-                        int outer, int inner) {
+DEVICE void load_square(Pair& near, Pair& far, const Bits* matrix, int outer, int inner) {
     int thread = threadIdx.x % 32, low = thread / 8 % 2 * 8, high = thread / 16 * 8;
     outer += is_right ? high : low;
     inner += is_right ? low : high;
@@ -99,14 +100,9 @@ DEVICE void multiply(const ProductParams& p) {
 #pragma unroll
         for (int k = 0; k < TILE; k += 16) {
             unsigned int rows[2][4], columns[4][2];
-            for (int i = 0; i < 2; i++) {
-                unsigned int near[2], far[2];
-                load_square<false, false>(near, far, matrix(step, 0), row + 16 * i, k);
-                rows[i][0] = near[0];
-                rows[i][1] = near[1];
-                rows[i][2] = far[0];
-                rows[i][3] = far[1];
-            }
+            for (int i = 0; i < 2; i++)
+                load_square<false, false>((Pair&)rows[i][0], (Pair&)rows[i][2], matrix(step, 0),
+                                          row + 16 * i, k);
             for (int j = 0; j < 4; j += 2)
                 load_square<is_right_transposed, true>(columns[j], columns[j + 1], matrix(step, 1),
                                                        column + 8 * j, k);

@@ -4,7 +4,7 @@
 constexpr int BATCH = 64;  // runs
 
 // The texels of a layout that an agent has not seen yet. If `bins`, adds them there, too.
-static int count_left(const ExplorerStepParams& p, int agent, const Runs& runs, const Pose& pose,
+static int count_left(const ExplorerStepParams& p, int agent, const Range& runs, const Pose& pose,
                       int* bins) {
     const unsigned int* seen = seen_by(p, agent);
     unsigned int last = p.n_words - 1;

@@ -7,7 +7,7 @@ constexpr int BATCH = 4;  // runs that a warp lane loads at once
 // The texels of a layout that an agent has not seen yet. If `binned`, adds them to bins in shared
 // memory, too.
 template <int binned>
-DEVICE int count_left(const ExplorerStepParams& p, int agent, const Runs& runs, const Pose& pose,
+DEVICE int count_left(const ExplorerStepParams& p, int agent, const Range& runs, const Pose& pose,
                       int warp_lane, int* bins) {
     const unsigned int* seen = seen_by(p, agent);
     unsigned int last = p.n_words - 1;
@@ -72,7 +72,7 @@ DEVICE void step_plain(const ExplorerStepParams& p, int agent, int warp_lane) {
     for (; over; over &= over - 1) {
         int owner = __ffs(over) - 1, other = agent - warp_lane + owner;
         int layout = layout_of(s, other / s.n_agents, p.error_flag);
-        Runs runs = runs_of(p, layout);
+        Range runs = runs_of(p, layout);
         int n_left = count_left<0>(p, other, runs, {0.f, 0.f, 0.f, 1.f}, warp_lane, 0);
         if (warp_lane == owner)
             write_coverage(p, episode, agent, layout, n_left);

@@ -31,13 +31,8 @@ struct ALIGNED Run {
     unsigned int word, bits;
 };
 
-// A layout's runs [first, end), within those that there are.
-struct Runs {
-    int first, end;
-};
-
-HD Runs runs_of(const ExplorerStepParams& p, int layout) {
-    return {within(p.run_starts[layout], p.n_runs), within(p.run_starts[layout + 1], p.n_runs)};
+HD Range runs_of(const ExplorerStepParams& p, int layout) {
+    return range_of(p.run_starts, layout, p.n_runs);
 }
 
 // The texels of a run that an agent has not seen yet, of whose words `last` is the last.

@@ -69,15 +69,11 @@ struct Env {
     unsigned int key0, key1;
 };
 
-RARE unsigned int word_of(int env, unsigned int n, unsigned int key0, unsigned int key1) {
-    return philox((unsigned int)env, n, key0, key1).a;
-}
-
 // A word of 32 random bits.
 HD unsigned int draw(Game& g, const Env& e) {
     unsigned int n = (unsigned int)g.n_draws;
     g.n_draws = (int)(n + 1u);
-    return word_of(e.env, n, e.key0, e.key1);
+    return random_word(e.env, (int)n, e.key0, e.key1);
 }
 
 // A random integer in [0, n).

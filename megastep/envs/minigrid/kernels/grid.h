@@ -124,11 +124,6 @@ HD int is_beside(const Grid& grid, int a, int b) {
     return absi(a % grid.width - b % grid.width) + absi(a / grid.width - b / grid.width) == 1;
 }
 
-// A word of 32 random bits.
-RARE unsigned int word_of(int env, int draw, unsigned int key0, unsigned int key1) {
-    return philox((unsigned int)env, (unsigned int)draw, key0, key1).a;
-}
-
 // Whether there are draws left in this step. Flags an error if not.
 RARE int may_draw(const Game& g, const Grid& grid) {
     if ((unsigned int)g.n_draws - (unsigned int)grid.first_draw < (unsigned int)MAX_DRAWS)
@@ -139,7 +134,7 @@ RARE int may_draw(const Game& g, const Grid& grid) {
 
 // A random integer in [low, high).
 RARE int draw(Game& g, const Grid& grid, int low, int high) {
-    unsigned int word = word_of(grid.env, g.n_draws++, grid.key0, grid.key1);
+    unsigned int word = random_word(grid.env, g.n_draws++, grid.key0, grid.key1);
     return low + (int)((unsigned long long)word * (unsigned int)(high - low) >> 32);
 }
 
