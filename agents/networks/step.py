@@ -12,7 +12,7 @@ from megastep.kernels.build.launch import Blocks, launch
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels" / "acting", FAST_CUDA_FLAGS)
 _LANES, _ROWS, _INNER, _STAGES, _THREADS = (
-    LIBRARY.constants[f"STEP_{name}"] for name in "LANES ROWS INNER STAGES THREADS".split()
+    LIBRARY.constants[name] for name in "LANES ROWS INNER STAGES THREADS".split()
 )
 MINGRU, LSTM = 2, 4  # the gates G of the cores that have a kernel
 OPERATIONS = {MINGRU: "mingru_step", LSTM: "lstm_step"}

@@ -56,7 +56,6 @@ HD int is_occluded(const float* walls, int n, const float* light, float dx, floa
     return 0;
 }
 
-// The light at a point of a layout.
 HD float light_at(const SceneryParams& s, int layout, float x, float y) {
     float sum = AMBIENT;
     int first_wall = s.wall_starts[layout], n_walls = s.wall_starts[layout + 1] - first_wall;

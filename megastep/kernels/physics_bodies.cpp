@@ -1,4 +1,3 @@
-// A loop over environments.
 #include "physics_bodies.h"
 
 KERNEL physics_bodies(const PhysicsBodiesParams& p) {

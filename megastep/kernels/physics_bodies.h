@@ -555,7 +555,6 @@ HD void solve_drag(Bodies& b, int i, float h) {
     b.drag_turn[i] = turn;
 }
 
-// Forgets the last substep's impulses.
 HD void begin_substep(Bodies& b, int i, int n_agents) {
     b.drag_x[i] = b.drag_y[i] = b.drag_turn[i] = 0.f;
     b.before[i] = b.hulls[i];
@@ -597,7 +596,6 @@ HD void take_back(Bodies& b, int i, int n_agents) {
     b.velocity.turn[i] = 0.f;
 }
 
-// Adds up what holding took in a substep.
 HD void add_load(Bodies& b, int k) {
     b.load[k] += SQRT(b.hold[k][0] * b.hold[k][0] + b.hold[k][1] * b.hold[k][1]);
     b.load_turn[k] += ABS(b.hold[k][2]);

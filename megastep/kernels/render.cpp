@@ -39,7 +39,6 @@ struct Rays {
     }
 };
 
-// The projections of lines, one array per field.
 struct Projections {
     std::vector<int> first, end, near_clipped;
     std::vector<float> base, gain;

@@ -59,7 +59,6 @@ HD void write_miss(const RenderParams& p, long long ray) {
     }
 }
 
-// The colour where a ray hits an agent or an object.
 template <int drawn>
 HD Colour moving_colour(const RenderParams& p, const EnvScenery& scenery, const Surface& surface,
                         const Hit& hit, const Float4* objects) {

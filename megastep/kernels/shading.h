@@ -3,7 +3,6 @@
 #include "draw_objects.h"
 #include "raster.h"
 
-// One environment's lines and texels.
 struct EnvScenery {
     const float* agent_lines;
     const float* agent_textures;

@@ -3,7 +3,6 @@
 #include "light.h"
 #include "params.h"
 
-// Moves line m of the model to the agent's pose.
 HD void update_line(const SceneryParams& s, const Pose& pose, int agent, int m) {
     Float4 line = line_at(LOAD((const Float4*)s.model + m), 1.f, pose);
     ((Float4*)s.agent_lines)[agent * (long long)s.n_model + m] = line;

@@ -14,6 +14,7 @@ constexpr int N_SUMS = 7;        // of PPO's loss: see PpoLossParams
 constexpr int TD_THREADS = 256;  // of a block
 constexpr int TD_SEQUENCES = 8;  // of a block, whose numbers fill a sector of 32 bytes
 constexpr int N_TD_SUMS = 7;
+constexpr int N_TD_METRICS = 7;
 
 struct ReturnsParams {
     const float* reward;             // (T, B)

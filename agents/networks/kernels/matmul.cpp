@@ -96,7 +96,6 @@ static void tiles(const MatmulParams& p, const float* packed, int first, int end
         tile<1, M>(p, packed, first, end, row, column, n);
 }
 
-// Rows [row, last_row) of the result.
 static void multiply(const MatmulParams& p, int row, int last_row, float* packed) {
     int n_blocks = (p.depth + DEPTH - 1) / DEPTH;
     for (int column = 0; column < p.n_columns; column += PANEL) {

@@ -37,7 +37,6 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
     return sum_of_block<MASKED_THREADS>(sum);
 }
 
-// Writes the part of this block.
 DEVICE void write_part(float* parts, float count, float mean, float squares) {
     float* part = parts + 3ll * ((long long)blockIdx.y * gridDim.x + blockIdx.x);
     if (threadIdx.x)

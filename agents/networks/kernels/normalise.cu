@@ -32,7 +32,6 @@ DEVICE Feature find(const NormaliseParams& p, int number) {
     return feature;
 }
 
-// The rows of the leaves that a thread reads.
 struct Rows {
     unsigned int source[NORMALISED_ROWS], target[NORMALISED_ROWS];
     bool exists[NORMALISED_ROWS];
@@ -69,7 +68,6 @@ DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int colum
     }
 }
 
-// Any four features, one by one.
 DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int column) {
     float values[NORMALISED_ROWS][4];
     for (int n = 0; n < 4; n++) {

@@ -102,7 +102,6 @@ struct AddMomentsParams {
     const unsigned char* is_counted;  // (), false: nothing changes; null: true
 };
 
-// A weight, and where it is rounded to.
 struct CastRowParams {
     const float* source;  // (n)
     void* target;         // (n_padded) bfloat16, at a multiple of 16 bytes

@@ -15,7 +15,6 @@ struct Strip {
     int start, end, step;  // rows of the thread: start, start + step, ... up to end, exclusive
 };
 
-// The place of this thread in a strip of n_rows.
 DEVICE Strip find_strip(int strip, int words, int n_rows) {
     int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
     int groups = WARP / words, group = lane / words, first = strip * STRIP;

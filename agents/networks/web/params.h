@@ -63,7 +63,6 @@ struct PolicyConvolveParams {
     int n_lanes;
 };
 
-// Sets a hidden state to 0 where an episode starts.
 struct PolicyClearParams {
     const unsigned char* reset;  // (B)
     float* state;                // (B, W)

@@ -45,7 +45,6 @@ KERNEL policy_normalise(const PolicyNormaliseParams& p) {
     }
 }
 
-// The products of four rows of a matrix with a vector.
 static Four products(const float* const rows[4], const float* x, int n) {
     Four sums[4] = {};
     int i = 0;

@@ -5,7 +5,6 @@
 #include "common/sums.h"
 #include "params.h"
 
-// Where a sequence starts.
 struct Start {
     unsigned int slot, lane;
 };

@@ -21,9 +21,8 @@ HD float cross(float ax, float ay, float bx, float by) { return ax * by - ay * b
 
 HD int is_finite(float x) { return x - x == 0.f; }
 
-// [first, end)
 struct Range {
-    int first, end;
+    int first, end;  // exclusive
 };
 
 // Where those of owner i begin and end, of n in all.

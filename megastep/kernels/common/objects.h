@@ -62,7 +62,6 @@ HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
 
 HD Body* bodies_of(const ObjectsParams& o) { return (Body*)o.bodies; }
 
-// Those of environment `env`.
 HD Object* objects_of(const ObjectsParams& o, int env) {
     return objects_of(o) + (long long)env * o.n_objects;
 }
@@ -107,7 +106,6 @@ HD Float4 line_at(const Float4& ends, float size, const Pose& pose) {
             pose.y + (pose.sine * bx + pose.cosine * by)};
 }
 
-// The lines of an environment's object k.
 HD Range lines_of(const ObjectsParams& o, int k) { return range_of(o.line_starts, k, o.n_lines); }
 
 // Half the diagonal of object k, if it is a body, since bodies never overlap; else its size.

@@ -43,7 +43,8 @@ DEVICE float sigmoid(float x) { return 0.5f * tanh_of(0.5f * x) + 0.5f; }
 
 // ---- Tensor cores ----
 
-// Loads two matrices of 8 x 8 bfloat16. Lanes 8 i to 8 i + 7 of the warp give the rows of matrix i.
+// Loads two matrices of 8 x 8 bfloat16, or four. Lanes 8 i to 8 i + 7 of the warp give the rows of
+// matrix i.
 DEVICE void load_matrices(unsigned int (&parts)[2], const void* row) {
     unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
     asm volatile("ldmatrix.sync.aligned.m8n8.x2.shared.b16 {%0, %1}, [%2];"
@@ -52,7 +53,6 @@ DEVICE void load_matrices(unsigned int (&parts)[2], const void* row) {
                  : "memory");
 }
 
-// Loads four such matrices.
 DEVICE void load_matrices(unsigned int (&first)[2], unsigned int (&second)[2], const void* row) {
     unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
     asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
@@ -65,7 +65,7 @@ DEVICE void load_matrices(unsigned int (&parts)[4], const void* row) {
     load_matrices((unsigned int (&)[2])parts[0], (unsigned int (&)[2])parts[2], row);
 }
 
-// Loads two matrices of 8 x 8 bfloat16, transposed.
+// As load_matrices, transposed.
 DEVICE void load_transposed(unsigned int (&parts)[2], const void* row) {
     unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
     asm volatile("ldmatrix.sync.aligned.m8n8.x2.trans.shared.b16 {%0, %1}, [%2];"
@@ -74,7 +74,6 @@ DEVICE void load_transposed(unsigned int (&parts)[2], const void* row) {
                  : "memory");
 }
 
-// Loads four such matrices.
 DEVICE void load_transposed(unsigned int (&first)[2], unsigned int (&second)[2], const void* row) {
     unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
     asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
@@ -111,7 +110,6 @@ DEVICE void begin_copy_or_clear(void* shared, const void* global, bool exists) {
                  : "memory");
 }
 
-// Ends a group of copies.
 DEVICE void end_group() { asm volatile("cp.async.commit_group;" ::: "memory"); }
 
 // Waits until this thread's groups of copies but the latest n are done.

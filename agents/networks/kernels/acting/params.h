@@ -2,11 +2,11 @@
 // B lanes, W units, a multiple of 64.
 #pragma once
 
-constexpr int STEP_LANES = 128;    // of a block
-constexpr int STEP_ROWS = 128;     // of the weights, of a block
-constexpr int STEP_INNER = 64;     // numbers of the product's inner axis at once, a part
-constexpr int STEP_STAGES = 3;     // parts in shared memory
-constexpr int STEP_THREADS = 256;  // of a block
+constexpr int LANES = 128;    // of a block
+constexpr int ROWS = 128;     // of the weights, of a block
+constexpr int INNER = 64;     // numbers of the product's inner axis at once, a part
+constexpr int STAGES = 3;     // parts in shared memory
+constexpr int THREADS = 256;  // of a block
 
 // One step of the minGRU (G = 2 gates: update, candidate) or of the LSTM (G = 4: input, forget,
 // candidate, output). The inner axis of the weights has K = W numbers, those of x, or K = 2 W,

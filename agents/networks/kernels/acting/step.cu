@@ -15,8 +15,6 @@
 #include "common/tensor_cores.h"
 #include "params.h"
 
-constexpr int LANES = STEP_LANES, ROWS = STEP_ROWS, INNER = STEP_INNER, STAGES = STEP_STAGES;
-constexpr int THREADS = STEP_THREADS;
 constexpr int WARP_LANES = 32;
 constexpr int LANE_TILES = WARP_LANES / 16;  // of a warp's results
 constexpr int WORD = 16;                     // bytes
@@ -38,7 +36,6 @@ DEVICE float activate(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
 // is at the place of word w, ^ WORD * i.
 DEVICE int word_at(int row, int word) { return row * ROW_BYTES + (word ^ (row & 7)) * WORD; }
 
-// What a block and a warp of a core with so many gates compute.
 template <int N_GATES>
 struct Block {
     static constexpr int GATES = N_GATES;

@@ -98,7 +98,6 @@ DEVICE unsigned int add(unsigned int a, unsigned int b) {
     return pack_bfloat16(low_half(a) + low_half(b), high_half(a) + high_half(b));
 }
 
-// Adds eight pairs of numbers.
 DEVICE uint4 add(uint4 a, uint4 b) {
     return {add(a.x, b.x), add(a.y, b.y), add(a.z, b.z), add(a.w, b.w)};
 }

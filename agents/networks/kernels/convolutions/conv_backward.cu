@@ -115,7 +115,6 @@ DEVICE void load(BackwardWeights<R>& weights, const ConvBackwardParams& p, const
 
 // ---- Tiles ----
 
-// Where a tile is in shared memory.
 struct Tile {
     Arrivals* arrivals;  // of d_features and features
     Bits* d_features;    // as they are in global memory

@@ -6,7 +6,6 @@
 
 constexpr int NO_PIXEL = 0x7fffffff;
 
-// What the bot needs of a view.
 struct Glance {
     int pixel;  // the agents' pixel closest to the centre: twice its distance, times R, plus it
     int left, right;  // depth of either half, in integers, so that no order of adding matters
@@ -65,7 +64,6 @@ HD int turn(float target, float spin, float seconds) {
     return best;
 }
 
-// Chooses a lane's action from what it sees, and updates its state.
 template <class Group>
 HD void act(const BotParams& p, const Group& group, int lane) {
     Glance view = glance(p, group, lane);

@@ -1,4 +1,3 @@
-// A loop over agents.
 #include "explorer_step.h"
 
 constexpr int BATCH = 64;  // runs

@@ -69,7 +69,6 @@ struct Env {
     unsigned int key0, key1;
 };
 
-// A word of 32 random bits.
 HD unsigned int draw(Game& g, const Env& e) {
     unsigned int n = (unsigned int)g.n_draws;
     g.n_draws = (int)(n + 1u);

@@ -1,4 +1,3 @@
-// A loop over environments.
 #include "minigrid_step.h"
 
 KERNEL minigrid_step(const MiniGridStepParams& p) {
