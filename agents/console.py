@@ -156,7 +156,7 @@ def restore() -> None:
 
 
 class Progress:
-    """A context: a bar with a line of text; where there is no terminal, a line every 10 seconds."""
+    """A line of text with a `bar`, a context; where there is no terminal, one every 10 seconds."""
 
     def __init__(self, wait: float = 0):
         from rich import progress  # only for those who wait
@@ -169,13 +169,6 @@ class Progress:
             disable=is_dumb or bool(prefix) or not sys.stdout.isatty(),
         )
         self.task = self.bar.add_task("starting", total=1)
-
-    def __enter__(self) -> "Progress":
-        self.bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.stop()
 
     def show(self, fraction: float | None, words: Sequence[str]) -> None:
         """Shows words on one line; `fraction` of the work is done, None if it has no end."""
@@ -199,8 +192,8 @@ def count(done: int, total: int) -> None:
 @contextlib.contextmanager
 def counting(what: str) -> Iterator[None]:
     """Shows how much of the work inside is done, such as `episodes`, and the time left."""
-    last, began, first = -1, 0.0, 0
-    with Progress(wait=LINE_EVERY) as progress:
+    last, began, first, progress = -1, 0.0, 0, Progress(wait=LINE_EVERY)
+    with progress.bar:
 
         def show(done: int, total: int) -> None:
             nonlocal last, began, first

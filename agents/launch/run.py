@@ -147,7 +147,7 @@ class Run:
                 env_failures.caught(self.cfg.env, self.folder, self.saved),
                 signals.handled(signals.announce) as numbers,
                 self.around(),
-                self.progress if self.is_first else contextlib.nullcontext(),
+                self.progress.bar if self.is_first else contextlib.nullcontext(),
                 contextlib.closing(self.training),
             ):
                 self.training.train(lambda: bool(numbers))

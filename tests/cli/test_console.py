@@ -20,7 +20,7 @@ def shown(monkeypatch, kind):
         patch.setattr(sys, "stdout", stdout)
         patch.delenv("COLUMNS", raising=False)
         patch.setenv("TERM", kind)
-        with console.Progress() as progress:
+        with (progress := console.Progress()).bar:
             progress.show(0.5, ["582M samples", "5 s left"])
             progress.show(None, ["583M samples"])
         stdout.flush()
