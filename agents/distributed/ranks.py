@@ -88,9 +88,9 @@ class Ranks(NamedTuple):
             if different := [f"rank {n}" for n, one in enumerate(sums) if one != sums[0]]:
                 raise UserError(
                     f"The ranks drift apart: policy.{name} differs on {', '.join(different)}; "
-                    "earlier checkpoints are intact. Start all ranks with the same options and "
-                    "packages; a learner of your own averages gradients with "
-                    "megastep.agents.distributed.pooling.average_gradients"
+                    "start all with the same options and packages; a learner of your own averages "
+                    "gradients with megastep.agents.distributed.pooling.average_gradients. Earlier "
+                    "checkpoints are intact"
                 )
 
 
