@@ -60,16 +60,6 @@ def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
     return np.stack([corners, np.roll(corners, -1, 0)], 1)
 
 
-def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
-    """Returns agents' texels (K, 3), in 16 colours with a red front, and widths (A M,)."""
-    widths = texel_widths(model)
-    bodies = AGENT_COLOURS[np.arange(n_agents) % len(AGENT_COLOURS), None]
-    colours = np.repeat(bodies, len(model), 1)
-    colours[:, model.mean(1)[:, 0].argmax()] = FRONT_COLOUR
-    widths = np.tile(widths, n_agents)
-    return np.repeat(colours.reshape(-1, 3), widths, 0), widths
-
-
 def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Returns texels (T, 3) of walls of ``widths`` (W,) texels: random stripes of two colours."""
     n, palette = len(widths), WALL_COLOURS
@@ -162,7 +152,11 @@ def scenery(
     if not isinstance(device, torch.device):
         device = engine.device("auto" if device is None else device)
     model = agent_model()
-    agent_textures, model_widths = _agent_textures(n_agents, model)
+    bodies = AGENT_COLOURS[np.arange(n_agents) % len(AGENT_COLOURS), None]
+    colours = np.repeat(bodies, len(model), 1)
+    colours[:, model.mean(1)[:, 0].argmax()] = FRONT_COLOUR
+    model_widths = np.tile(texel_widths(model), n_agents)
+    agent_textures = np.repeat(colours.reshape(-1, 3), model_widths, 0)
     engine.fit(n_envs, 20 * n_agents * len(model) + 4 * len(agent_textures) + 64, device)
 
     wall_parts, light_parts = _part(geometries, "walls", (2, 2)), _part(geometries, "lights", (2,))
