@@ -54,5 +54,12 @@ KERNEL select_lanes(SelectLanesParams p) {
     wait_for_previous();
     const SelectParams& tensor = p.tensors[row_of_block(p.tensors, p.n_tensors)];
     unsigned int first = (blockIdx.x - tensor.first_block) * (BLOCK * COPY_WORDS) + threadIdx.x;
-    with_word(tensor.word_size, [&](auto word) { copy_words<decltype(word)>(p, tensor, first); });
+    if (tensor.word_size == 16)
+        copy_words<uint4>(p, tensor, first);
+    else if (tensor.word_size == 8)
+        copy_words<uint2>(p, tensor, first);
+    else if (tensor.word_size == 4)
+        copy_words<unsigned int>(p, tensor, first);
+    else
+        copy_words<unsigned char>(p, tensor, first);
 }

@@ -1,7 +1,6 @@
 // Reads sequences from the replay buffer, one thread per word. The first block computes the
 // importance weights, the next ones read the flags, then those of each tensor follow.
 #include "common/backend.h"
-#include "common/rows.h"
 #include "common/sums.h"
 #include "params.h"
 
@@ -23,6 +22,11 @@ DEVICE long long entry(const ReadSequencesParams& p, unsigned int sequence, unsi
     return (long long)(row < n_rows ? row : row - n_rows) * p.n_lanes + start.lane;
 }
 
+template <class Word>
+DEVICE void copy_word(const ReadTensorParams& tensor, unsigned int at, long long from) {
+    ((Word*)tensor.target)[at] = ((const Word*)tensor.source)[from];
+}
+
 DEVICE void read_word(const ReadSequencesParams& p, const ReadTensorParams& tensor,
                       unsigned int at) {
     unsigned int row = at / tensor.n_words, word = at % tensor.n_words;
@@ -30,13 +34,18 @@ DEVICE void read_word(const ReadSequencesParams& p, const ReadTensorParams& tens
     if (t >= tensor.n_rows)
         return;
     long long from = entry(p, sequence, t, tensor.rows_per_rollout) * tensor.n_words + word;
-    if (!tensor.word_size)
-        ((float*)tensor.target)[at] = HALF_VALUE(((const unsigned short*)tensor.source)[from]);
+    if (tensor.word_size == 16)
+        copy_word<uint4>(tensor, at, from);
+    else if (tensor.word_size == 8)
+        copy_word<uint2>(tensor, at, from);
+    else if (tensor.word_size == 4)
+        copy_word<unsigned int>(tensor, at, from);
+    else if (tensor.word_size == 2)
+        copy_word<unsigned short>(tensor, at, from);
+    else if (tensor.word_size == 1)
+        copy_word<unsigned char>(tensor, at, from);
     else
-        with_word(tensor.word_size, [&](auto word) {
-            typedef decltype(word) Word;
-            ((Word*)tensor.target)[at] = ((const Word*)tensor.source)[from];
-        });
+        ((float*)tensor.target)[at] = HALF_VALUE(((const unsigned short*)tensor.source)[from]);
 }
 
 DEVICE void read_flags(const ReadSequencesParams& p, unsigned int at) {
