@@ -4,6 +4,7 @@ Kernels run on a GPU, and on a CPU from the same source (`tests/helpers/cuda_on_
 """
 
 import contextlib
+import functools
 
 import pytest
 import torch
@@ -127,22 +128,17 @@ def test_only_a_residual_layer_adds_its_input():
 # ---- The kernels ----
 
 
-def recurrence(by_kernel, *inputs):
-    if by_kernel:
-        return lstm_module._Sequence.apply(torch.is_grad_enabled(), *inputs)
-    return lstm_module.lstm_sequence(*inputs)
+# on a CPU in float32, by clusters in bfloat16
+KERNEL = functools.partial(lstm_module._Sequence.apply, True)
+PLAIN = lstm_module.lstm_sequence
 
 
-def sequence(by_kernel, device, dtype, x, reset, state, weights, d_outputs, d_cell, residual=False):
-    """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU.
-
-    Args:
-        by_kernel: on a CPU in float32, by clusters in bfloat16. Else by PyTorch's operations.
-    """
+def sequence(form, device, dtype, x, reset, state, weights, d_outputs, d_cell, residual=False):
+    """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU."""
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
     with plain_operations():
-        outputs, last, cell = recurrence(by_kernel, *to, reset.to(device), *states, residual)
+        outputs, last, cell = form(*to, reset.to(device), *states, residual)
     assert residual or torch.equal(last, outputs[-1].float())
     assert outputs.dtype == dtype and cell.dtype == torch.float32
     grads = torch.autograd.grad(
@@ -171,7 +167,7 @@ def test_aligned_is_contiguous_in_16_byte_words(offset, shape):
 
 
 def whole_sequence(
-    by_kernel,
+    form,
     device,
     dtype,
     seed,
@@ -197,7 +193,7 @@ def whole_sequence(
     if nan_before_reset:
         inputs["reset"][n_steps // 2] = True
         inputs["x"][: n_steps // 2] = torch.nan
-    return sequence(by_kernel, device, dtype, **inputs, residual=is_residual)
+    return sequence(form, device, dtype, **inputs, residual=is_residual)
 
 
 @pytest.mark.parametrize(
@@ -208,9 +204,9 @@ def test_sequence_on_chip_matches_float32_in_every_order(
     cuda_on_cpu, monkeypatch, n_steps, n_lanes, is_residual, width
 ):
     case = 0, n_steps, n_lanes, False, is_residual, width
-    expected = whole_sequence(False, "cpu", torch.float32, *case)
+    expected = whole_sequence(PLAIN, "cpu", torch.float32, *case)
     cuda_on_cpu.install(monkeypatch)
-    case = True, "cpu", torch.bfloat16, *case
+    case = KERNEL, "cpu", torch.bfloat16, *case
     results = cuda_on_cpu.in_every_order(lambda: whole_sequence(*case))
     assert_close(NAMES, results, expected, SLACK[torch.bfloat16])
     names = {f"lstm_sequence_{direction}_{width}" for direction in ("forward", "backward")}
@@ -219,8 +215,8 @@ def test_sequence_on_chip_matches_float32_in_every_order(
 
 def test_plain_sequence_in_bfloat16_matches_float32():
     case = 0, 5, 3, False, False, 16
-    results = whole_sequence(False, "cpu", torch.bfloat16, *case)
-    expected = whole_sequence(False, "cpu", torch.float32, *case)
+    results = whole_sequence(PLAIN, "cpu", torch.bfloat16, *case)
+    expected = whole_sequence(PLAIN, "cpu", torch.float32, *case)
     assert_close(NAMES, results, expected, SLACK[torch.bfloat16])
 
 
@@ -231,12 +227,12 @@ def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, wi
     x = torch.empty(n_steps, n_lanes, width, dtype=torch.bfloat16, device="cuda")
     assert lstm_module._fits(x)
     case = 0, n_steps, n_lanes, False, False, width
-    first = whole_sequence(True, "cuda", torch.bfloat16, *case)
-    second = whole_sequence(True, "cuda", torch.bfloat16, *case)
+    first = whole_sequence(KERNEL, "cuda", torch.bfloat16, *case)
+    second = whole_sequence(KERNEL, "cuda", torch.bfloat16, *case)
     assert all(torch.equal(one, other) for one, other in zip(first, second, strict=True))
-    expected = whole_sequence(False, "cpu", torch.float32, *case)
+    expected = whole_sequence(PLAIN, "cpu", torch.float32, *case)
     assert_close(NAMES, first, expected, SLACK[torch.bfloat16])
-    by_steps = whole_sequence(False, "cuda", torch.bfloat16, *case)
+    by_steps = whole_sequence(PLAIN, "cuda", torch.bfloat16, *case)
     assert_close(NAMES, first, by_steps, SLACK[torch.bfloat16])
     first, by_steps = ([leaf.cpu() for leaf in leaves] for leaves in (first, by_steps))
     errors = [
@@ -253,7 +249,7 @@ def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, wi
 def test_sequence_on_chip_cuts_nan_at_resets():
     n_steps, n_lanes = 8, 50
     outputs, cell, d_x, *_, d_output, d_cell = whole_sequence(
-        True, "cuda", torch.bfloat16, 1, n_steps, n_lanes, nan_before_reset=True
+        KERNEL, "cuda", torch.bfloat16, 1, n_steps, n_lanes, nan_before_reset=True
     )
     assert outputs[: n_steps // 2].isnan().any() and outputs[n_steps // 2 :].isfinite().all()
     assert cell.isfinite().all() and d_x[n_steps // 2 :].isfinite().all()
@@ -265,7 +261,7 @@ def test_sequence_on_chip_cuts_nan_at_resets():
 CPU_SLACK = 2e-5
 
 
-def on_cpu(by_kernel, n_steps, n_lanes, width):
+def on_cpu(form, n_steps, n_lanes, width):
     """Returns outputs, last cell and all gradients by the CPU's kernel, or by PyTorch."""
     torch.manual_seed(0)
     inputs = [
@@ -280,7 +276,7 @@ def on_cpu(by_kernel, n_steps, n_lanes, width):
     reset = (torch.rand(n_lanes, n_steps) < 0.3).T
     d_results = torch.randn(n_steps, n_lanes, width), torch.randn(n_lanes, width)
     with plain_operations():
-        outputs, _, cell = recurrence(by_kernel, *inputs[:4], reset, *inputs[4:], False)
+        outputs, _, cell = form(*inputs[:4], reset, *inputs[4:], False)
     results = outputs, cell
     return [*results, *torch.autograd.grad(results, inputs, d_results)]
 
@@ -289,15 +285,15 @@ def on_cpu(by_kernel, n_steps, n_lanes, width):
     "shape", [(9, 5, 16), (1, 3, 48), (32, 64, 64), (3, 7, 256), (70, 1, 80)], ids=str
 )
 def test_cpu_sequence_matches_pytorch(shape):
-    expected = on_cpu(False, *shape)
-    assert_close(NAMES, on_cpu(True, *shape), expected, CPU_SLACK)
+    expected = on_cpu(PLAIN, *shape)
+    assert_close(NAMES, on_cpu(KERNEL, *shape), expected, CPU_SLACK)
 
 
 def test_cpu_sequence_has_the_same_bits_with_any_number_of_threads():
     results = []
     for n_threads in (1, 2, 3):
         engine.set_threads(n_threads)
-        results.append(on_cpu(True, 32, 65, 64))
+        results.append(on_cpu(KERNEL, 32, 65, 64))
     engine.set_threads(None)
     for other in results[1:]:
         assert all(map(torch.equal, results[0], other))
