@@ -531,6 +531,16 @@ def test_a_pillar_may_be_a_dot(d, cap, area):
     assert 7 * 5 - floor.area == pytest.approx(area, abs=0.01)
 
 
+def test_auto_is_the_default_and_a_part_of_a_viewport_is_refused():
+    room = '<path id="wall" fill="none" stroke="red" d="M0 0h8v6h-8z" stroke-width="{}"/>'
+    pillar = '<rect id="wall-2" x="3" y="2" width="2" height="2" rx="{}" ry="1"/>'
+    text = f"<svg>{room}{pillar}</svg>"
+    floor = imports.svg.read(text.format(1, "auto").encode(), 1)[0].floor
+    assert floor.area == pytest.approx(7 * 5 - np.pi, abs=0.02)
+    with pytest.raises(ValueError, match="stroke-width='3%' is a part of a viewport, which is not"):
+        imports.svg.read(text.format("3%", 1).encode(), 1)
+
+
 def test_what_is_not_read_of_a_drawing_is_said():
     text = (STRANGERS / "00_reference.svg").read_text()
     for change, words in {

@@ -125,6 +125,13 @@ def length(text: str, em: float = 16, whole: float = 1) -> float:
     return float(match[1]) * sizes[match[2].lower()]
 
 
+def _size(key, text, em) -> float:
+    """Returns a length that is no part of a viewport."""
+    if "%" in text:
+        raise ValueError(f"{key}={text[:20]!r} is a part of a viewport, which is not read")
+    return length(text, em)
+
+
 def is_marked(element: Element, mark: str) -> bool:
     """True if an element's id, class or label is the mark, in any case."""
     mark = mark.lower()
@@ -193,7 +200,7 @@ class _Reader:
         for is_important in (False, True):
             for body in sheets:
                 found |= body[is_important]
-        return found
+        return {key: value for key, value in found.items() if value != "auto"}  # the default
 
     def _visit(self, element, place) -> None:
         """Collects what is in an element."""
@@ -227,10 +234,7 @@ class _Reader:
         kind, matrix = (*marked, place.kind)[0], transform(once["transform"], place.matrix)
 
         def of(key, default: Any = 0) -> float:
-            text = str(own.get(key, default))
-            if "%" in text:
-                raise ValueError(f"{key}={text[:20]!r} is a part of a viewport, which is not read")
-            return length(text, em)
+            return _size(key, str(own.get(key, default)), em)
 
         place = _Place(matrix, style, opacity, kind, chain)
         if name == "use":
@@ -273,8 +277,10 @@ class _Reader:
                 self.meetings = outlines.check_meetings(drawn, self.meetings)
                 first = outlines.area_of(rings, style["fill-rule"] == "evenodd")
             shapes.append(first)
-        width = length(style["stroke-width"], float(style["font-size"]))
-        if width > 0 and is_painted(style["stroke"], style["stroke-opacity"]):
+        has_stroke = is_painted(style["stroke"], style["stroke-opacity"])
+        width = style["stroke-width"] if has_stroke else "0"
+        width = _size("stroke-width", width, float(style["font-size"]))
+        if width > 0:
             size = self.scale[0] * (1 if is_fixed else area**0.5)
             half = max(width, outlines.GRID / size) / 2
             self.meetings = outlines.check_meetings(drawn, self.meetings)
