@@ -8,9 +8,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")  # each worker imports torch, in seconds
 
 import functools
+import gc
 import logging
 import pickle
 from pathlib import Path
+from types import SimpleNamespace
 
 import filelock
 import pytest
@@ -143,8 +145,20 @@ def composed_once():
             ConfigLoaderImpl, "get_group_options", functools.partialmethod(once, list_options)
         )
         patch.setattr(ConfigRepository, "load_config", read_once)
+        quick = SimpleNamespace(deepcopy=lambda config: pickle.loads(pickle.dumps(config)))
+        patch.setattr(compose, "copy", quick)
         # Hydra copies all that is stored whenever it composes, and only reads it
         patch.setattr(ConfigStore, "__deepcopy__", lambda store, memo: store, raising=False)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def frozen_once():
+    """Has each command not count again what is left out of garbage collections."""
+    gc.collect()
+    gc.freeze()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gc, "get_freeze_count", lambda: 1)
         yield
 
 
