@@ -45,7 +45,6 @@ HD void settle(const ObjectsParams& o, const SceneryParams& s, const Object& obj
         flag_error(error_flag, i, BAD_COLOUR);
 }
 
-// An object's texel: red, green, blue and light.
 HD Float4 texel_of(const ObjectsParams& o, const Object& object, float light) {
     int exists = (unsigned int)object.colour < (unsigned int)o.n_colours;
     const float* rgb = o.palette + 3 * (exists ? object.colour : 0);

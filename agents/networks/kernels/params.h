@@ -86,7 +86,6 @@ struct MomentsParams {
     int n_lanes;
 };
 
-// A leaf's running statistics, and the moments to add to them.
 struct RunningNormParams {
     float* mean;                 // (n)
     float* scale;                // (n)
