@@ -20,7 +20,7 @@ from megastep.engine.launch_params import (
     world_params,
 )
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.launch import ENGINE, WARP, launch
+from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
 
 #: Threads that move an environment's agents, on a GPU: the most with which all environments move
 #: at once, or else the least.
@@ -31,6 +31,7 @@ APART = 0.05  # metres
 #: Of baked light in the cache: the beginning of files' names, their number, and the fewest layouts.
 PREFIX, MAX_FILES, MIN_CACHED = "baked-light-", 16, 32
 MAX_SLOTS = ENGINE.constants["MAX_SLOTS"]  # agents and movable objects of an environment
+BODIES_BYTES, SLOT_BYTES = (ENGINE.constants[name] for name in ("BODIES_BYTES", "SLOT_BYTES"))
 
 
 def bake(scenery: Scenery) -> None:
@@ -122,12 +123,15 @@ def physics(
     threads_per_env = next((size for size in GROUPS if size * n <= room), GROUPS[-1])
     shape, of_bodies = threads_per_env * n, {}
     if scenery.objects is not None and scenery.objects.n_bodies:
-        if a + scenery.objects.n_bodies > MAX_SLOTS:
+        n_free = MAX_SLOTS - a - scenery.objects.n_bodies
+        if n_free < 0:
             raise ValueError(
                 f"an environment has at most {MAX_SLOTS} agents and movable objects together, but "
                 f"there are {a} and {scenery.objects.n_bodies}"
             )
-        kernel, shape = "physics_bodies", WARP * n
+        n_envs = BLOCK // WARP  # per block
+        n_bytes = n_envs * (BODIES_BYTES - n_free * SLOT_BYTES)
+        kernel, shape = "physics_bodies", Blocks(-(-n // n_envs), shared=n_bytes)
         names = "force", "grip", "ramp_steps", "grab_elevated"
         of_bodies = {name: getattr(scenery.objects, name) for name in names}
     launch(

@@ -16,6 +16,8 @@
 
 constexpr int MAX_CANDIDATES = 128;  // pairs of hulls that may touch in a step
 constexpr int MAX_TOUCHES = 64;      // that do in a substep
+constexpr int BODIES_BYTES = 8772;   // of shared memory per environment with all slots
+constexpr int SLOT_BYTES = 164;      // of a slot
 constexpr int SUBSTEPS = 4;
 constexpr int ITERATIONS = 3;
 constexpr float SLOP = 0.002f;         // metres of overlap that are left alone
@@ -37,110 +39,120 @@ constexpr int WALL = 1;
 constexpr int OBJECT = 2;
 
 struct Motion {
-    float x[MAX_SLOTS], y[MAX_SLOTS], turn[MAX_SLOTS];
+    float x, y, turn;
 };
 
-// One environment in a step: a column per slot, candidate, and touch. Of a body that cannot move,
-// the inverse mass is 0.
+// An agent or a body. Of one that cannot move, the inverse mass is 0.
+struct Slot {
+    Hull hull, before;  // now, and before the substep
+    float angle, angle_before;
+    Motion velocity, shift;  // m/s and rad/s; metres and radians
+    float wish_x, wish_y;    // m/s, 0 of bodies
+    float inv_mass, inv_inertia;
+    float drag;                       // newtons, at most, between slot and floor
+    float drag_x, drag_y, drag_turn;  // impulses in this substep
+    float hold_x, hold_y, hold_turn;  // of what is held, as the next
+    float hold[3];                    // impulse and torque in this substep
+    float load, load_turn;            // their sums over all substeps
+    float extent, speed;
+    signed char exists, holder, hit, overlaps, taken_back, last;
+    signed char elevated;  // of agents, as in ObjectsParams, but 1 for all above 0
+    int unused;            // threads' slots are an odd number of words apart, in different banks
+};
+
+// One environment in a step: a column per candidate and touch. A GPU has memory for the slots that
+// there are.
 struct Bodies {
-    Hull hulls[MAX_SLOTS], before[MAX_SLOTS];  // now, and before the substep
-    float angles[MAX_SLOTS], angles_before[MAX_SLOTS];
-    Motion velocity, shift;                      // m/s and rad/s; metres and radians
-    float wish_x[MAX_SLOTS], wish_y[MAX_SLOTS];  // m/s, 0 of bodies
-    float inv_mass[MAX_SLOTS], inv_inertia[MAX_SLOTS];
-    float drag[MAX_SLOTS];  // newtons, at most, between slot and floor
-    float drag_x[MAX_SLOTS], drag_y[MAX_SLOTS], drag_turn[MAX_SLOTS];  // impulses in this substep
-    float hold_x[MAX_BODIES], hold_y[MAX_BODIES], hold_turn[MAX_BODIES];
-    float hold[MAX_BODIES][3];                      // impulse and torque in this substep
-    float load[MAX_BODIES], load_turn[MAX_BODIES];  // their sums over all substeps
-    float extent[MAX_SLOTS], speeds[MAX_SLOTS];
-    signed char exists[MAX_SLOTS], holders[MAX_SLOTS], hit[MAX_SLOTS];
-    signed char overlaps[MAX_SLOTS], taken_back[MAX_SLOTS];
-    signed char elevated[MAX_SLOTS];  // of agents, as in ObjectsParams, but 1 for all above 0
     int candidates[MAX_CANDIDATES];
     signed char touch_a[MAX_TOUCHES], touch_b[MAX_TOUCHES], levels[MAX_TOUCHES];
     Touch touches[MAX_TOUCHES];
     float impulses[MAX_TOUCHES][2];
-    signed char last[MAX_SLOTS];
     int n_levels;
+    Slot slots[MAX_SLOTS];
 };
+
+static_assert(sizeof(Bodies) == BODIES_BYTES && sizeof(Slot) == SLOT_BYTES,
+              "Python allocates shared memory for them");
 
 HD int n_slots_of(const PhysicsBodiesParams& p) { return p.scenery.n_agents + p.objects.n_bodies; }
 
 // Fills in an agent's slot. Its disc is larger than the one that no wall may enter, by what may
 // overlap. Its velocity is the real one; its action changes what it wishes.
 HD void begin_agent(const PhysicsBodiesParams& p, Bodies& b, int env, int a) {
+    Slot& slot = b.slots[a];
     int i = env * p.scenery.n_agents + a;
-    b.angles[a] = p.angles[i];
-    b.hulls[a] = hull_at(p.positions[2 * i], p.positions[2 * i + 1], b.angles[a],
-                         p.scenery.radius * INFLATION + MAX_OVERLAP, -1.f);
-    b.velocity.x[a] = p.velocity[2 * i];
-    b.velocity.y[a] = p.velocity[2 * i + 1];
+    slot.angle = p.angles[i];
+    slot.hull = hull_at(p.positions[2 * i], p.positions[2 * i + 1], slot.angle,
+                        p.scenery.radius * INFLATION + MAX_OVERLAP, -1.f);
+    slot.velocity.x = p.velocity[2 * i];
+    slot.velocity.y = p.velocity[2 * i + 1];
     if (p.actions)
         apply_action(p, env, i);
     if (p.controls)
         apply_controls(p, env, i);
-    b.wish_x[a] = p.velocity[2 * i];
-    b.wish_y[a] = p.velocity[2 * i + 1];
-    b.velocity.turn[a] = p.angvelocity[i] * RADIANS;
-    b.inv_mass[a] = 1.f / AGENT_MASS;
-    b.inv_inertia[a] = 0.f;  // nothing but its action turns it
-    b.drag[a] = p.force;
-    b.exists[a] = 1;
-    b.holders[a] = -1;
-    b.extent[a] = b.hulls[a].hx;
+    slot.wish_x = p.velocity[2 * i];
+    slot.wish_y = p.velocity[2 * i + 1];
+    slot.velocity.turn = p.angvelocity[i] * RADIANS;
+    slot.inv_mass = 1.f / AGENT_MASS;
+    slot.inv_inertia = 0.f;  // nothing but its action turns it
+    slot.drag = p.force;
+    slot.exists = 1;
+    slot.holder = -1;
+    slot.extent = slot.hull.hx;
 }
 
 // Fills in the slot of a body, whose object is at rest if it is not to move.
 HD void begin_body(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
     const ObjectsParams& o = p.objects;
-    int slot = p.scenery.n_agents + k, object_index = object_of_body(o, k);
+    int object_index = object_of_body(o, k);
+    Slot& slot = b.slots[p.scenery.n_agents + k];
     Object object = objects_of(o)[env * o.n_objects + object_index];
     Body body = bodies_of(o)[env * o.n_bodies + k];
     float hy = half_width_of(o, object_index, object.size);
-    b.hulls[slot] = hull_at(object.x, object.y, object.angle, object.size, hy);
-    b.angles[slot] = object.angle;
-    b.exists[slot] = is_obstacle(object) && is_drawn(object);
-    b.extent[slot] = extent_of(object.size, hy);
+    slot.hull = hull_at(object.x, object.y, object.angle, object.size, hy);
+    slot.angle = object.angle;
+    slot.exists = is_obstacle(object) && is_drawn(object);
+    slot.extent = extent_of(object.size, hy);
     int moves =
-        b.exists[slot] && body.movable && !body.locked && body.mass > 0.f && is_finite(body.mass);
+        slot.exists && body.movable && !body.locked && body.mass > 0.f && is_finite(body.mass);
     float gyration2 = hy < 0.f ? 0.5f * object.size * object.size
                                : (object.size * object.size + hy * hy) * (1.f / 3.f);
-    b.inv_mass[slot] = moves ? 1.f / body.mass : 0.f;
-    b.inv_inertia[slot] = moves ? 1.f / (body.mass * gyration2) : 0.f;
-    b.velocity.x[slot] = moves ? body.vx : 0.f;
-    b.velocity.y[slot] = moves ? body.vy : 0.f;
-    b.velocity.turn[slot] = moves ? body.turning * RADIANS : 0.f;
-    b.wish_x[slot] = b.wish_y[slot] = 0.f;
-    b.drag[slot] = body.friction * body.mass * GRAVITY;
-    b.load[k] = 0.f;
-    b.load_turn[k] = 0.f;
-    b.hold_x[k] = body.hold_x;
-    b.hold_y[k] = body.hold_y;
-    b.hold_turn[k] = body.hold_turn;
-    b.holders[slot] = moves && is_agent(body.holder, p.scenery.n_agents) ? body.holder : -1;
+    slot.inv_mass = moves ? 1.f / body.mass : 0.f;
+    slot.inv_inertia = moves ? 1.f / (body.mass * gyration2) : 0.f;
+    slot.velocity.x = moves ? body.vx : 0.f;
+    slot.velocity.y = moves ? body.vy : 0.f;
+    slot.velocity.turn = moves ? body.turning * RADIANS : 0.f;
+    slot.wish_x = slot.wish_y = 0.f;
+    slot.drag = body.friction * body.mass * GRAVITY;
+    slot.load = 0.f;
+    slot.load_turn = 0.f;
+    slot.hold_x = body.hold_x;
+    slot.hold_y = body.hold_y;
+    slot.hold_turn = body.hold_turn;
+    slot.holder = moves && is_agent(body.holder, p.scenery.n_agents) ? body.holder : -1;
 }
 
 // Stores where a body is in its holder's frame if it was just grabbed. Else has the holder let go
 // if one of the two was put elsewhere, or if it is elevated and may not grab.
 HD void begin_hold(const PhysicsBodiesParams& p, Bodies& b, int env, int k) {
-    int slot = p.scenery.n_agents + k, a = b.holders[slot];
+    Slot& slot = b.slots[p.scenery.n_agents + k];
+    int a = slot.holder;
     if (a < 0)
         return;
-    const Hull& agent = b.hulls[a];
-    float dx = b.hulls[slot].x - agent.x, dy = b.hulls[slot].y - agent.y;
+    const Hull& agent = b.slots[a].hull;
+    float dx = slot.hull.x - agent.x, dy = slot.hull.y - agent.y;
     float x = agent.cosine * dx + agent.sine * dy, y = agent.cosine * dy - agent.sine * dx;
     Body& body = bodies_of(p.objects)[env * p.objects.n_bodies + k];
     if (body.grabbed) {
         body.grabbed = 0;
-        body.hold_x = b.hold_x[k] = x;
-        body.hold_y = b.hold_y[k] = y;
-        body.hold_turn = b.hold_turn[k] = b.angles[slot] - b.angles[a];
+        body.hold_x = slot.hold_x = x;
+        body.hold_y = slot.hold_y = y;
+        body.hold_turn = slot.hold_turn = slot.angle - b.slots[a].angle;
     }
-    float off_x = x - b.hold_x[k], off_y = y - b.hold_y[k];
-    int is_up = b.elevated[a] > 0 && !p.grab_elevated;
+    float off_x = x - slot.hold_x, off_y = y - slot.hold_y;
+    int is_up = b.slots[a].elevated > 0 && !p.grab_elevated;
     if (is_up || off_x * off_x + off_y * off_y > MAX_STRETCH * MAX_STRETCH)
-        b.holders[slot] = -1;
+        slot.holder = -1;
 }
 
 // The speed of the fastest point of a hull.
@@ -150,31 +162,33 @@ HD float speed_of(float vx, float vy, float turning, float extent) {
 
 // How fast a slot may become in a step: what is held, as fast as its holder moves and turns it.
 HD float top_speed(const Bodies& b, int i, int n_agents) {
-    if (!b.exists[i])
+    const Slot& slot = b.slots[i];
+    if (!slot.exists)
         return 0.f;
-    float now = speed_of(b.velocity.x[i], b.velocity.y[i], b.velocity.turn[i], b.extent[i]);
+    float turning = slot.velocity.turn;
+    float now = speed_of(slot.velocity.x, slot.velocity.y, turning, slot.extent);
     if (i < n_agents)
-        return maxf(now, speed_of(b.wish_x[i], b.wish_y[i], b.velocity.turn[i], b.extent[i]));
-    int a = b.holders[i];
-    if (a < 0)
+        return maxf(now, speed_of(slot.wish_x, slot.wish_y, turning, slot.extent));
+    if (slot.holder < 0)
         return now;
-    float arm = speed_of(b.hold_x[i - n_agents], b.hold_y[i - n_agents], 1.f, b.extent[i]);
-    return maxf(now, speed_of(b.velocity.x[a], b.velocity.y[a], b.velocity.turn[a], arm));
+    const Motion& holder = b.slots[slot.holder].velocity;
+    float arm = speed_of(slot.hold_x, slot.hold_y, 1.f, slot.extent);
+    return maxf(now, speed_of(holder.x, holder.y, holder.turn, arm));
 }
 
 // Returns 1 if agent a, before the low side of the ramp in a slot and within reach of it, drives
 // ahead in its direction: from the low side at -hx to the high one.
 HD int drives_up(const Bodies& b, int a, int slot, float reach) {
-    const Hull &agent = b.hulls[a], &ramp = b.hulls[slot];
+    const Hull &agent = b.slots[a].hull, &ramp = b.slots[slot].hull;
     float dx = agent.x - ramp.x, dy = agent.y - ramp.y;
     float x = ramp.cosine * dx + ramp.sine * dy + ramp.hx, y = ramp.cosine * dy - ramp.sine * dx;
     return x < 0.f && x > -reach && ABS(y) <= ramp.hy &&
-           ramp.cosine * b.wish_x[a] + ramp.sine * b.wish_y[a] > 0.f;
+           ramp.cosine * b.slots[a].wish_x + ramp.sine * b.slots[a].wish_y > 0.f;
 }
 
 // Returns 1 if agent a is over the high side of the ramp in a slot.
 HD int is_over(const Bodies& b, int a, int slot) {
-    const Hull &agent = b.hulls[a], &ramp = b.hulls[slot];
+    const Hull &agent = b.slots[a].hull, &ramp = b.slots[slot].hull;
     float x = ramp.cosine * (agent.x - ramp.x) + ramp.sine * (agent.y - ramp.y);
     return x + agent.hx + EDGE >= ramp.hx;
 }
@@ -185,15 +199,15 @@ HD int elevation_of(const PhysicsBodiesParams& p, const Bodies& b, int env, int 
     const ObjectsParams& o = p.objects;
     int n_agents = p.scenery.n_agents, up = o.elevated[env * n_agents + a], stays = 0;
     for (int k = 0; k < o.n_bodies && up <= 1 && !stays; k++)
-        stays = (up == 1 || up == -1 - k) && b.exists[n_agents + k] &&
-                gap_of(touch(b.hulls[a], b.hulls[n_agents + k])) < 0.f;
+        stays = (up == 1 || up == -1 - k) && b.slots[n_agents + k].exists &&
+                gap_of(touch(b.slots[a].hull, b.slots[n_agents + k].hull)) < 0.f;
     if (up > 1)
         up--;
     else if (!stays)
         up = 0;
-    float reach = b.extent[a] + top_speed(b, a, n_agents) * p.seconds;
+    float reach = b.slots[a].extent + top_speed(b, a, n_agents) * p.seconds;
     for (int k = 0; k < o.n_bodies && up == 0; k++)
-        if (o.shapes[object_of_body(o, k)] == RAMP && b.exists[n_agents + k] &&
+        if (o.shapes[object_of_body(o, k)] == RAMP && b.slots[n_agents + k].exists &&
             drives_up(b, a, n_agents + k, reach))
             up = -1 - k;
     return up < 0 && is_over(b, a, n_agents - 1 - up) ? p.ramp_steps : up;
@@ -212,24 +226,25 @@ HD void add_candidate(const Group& group, Bodies& b, int has, int a, int kind, i
         b.candidates[at] = a | kind << 5 | index << 7;
     if (at < MAX_CANDIDATES)
         return;
-    b.overlaps[a] = 1;
+    b.slots[a].overlaps = 1;
     if (kind == SLOT)
-        b.overlaps[index] = 1;
+        b.slots[index].overlaps = 1;
 }
 
 // Returns 1 if an object that is no body, of environment `env`, is an obstacle within reach of slot
 // a. Some are larger than a disc of their size: 1.5 is beyond crates' corners.
 HD int is_near(const ObjectsParams& o, const Bodies& b, int env, int a, int k, float reach) {
     Object object = objects_of(o)[env * o.n_objects + k];
-    float apart = b.extent[a] + 1.5f * object.size + reach;
-    return o.object_bodies[k] < 0 && is_obstacle(object) && ABS(object.x - b.hulls[a].x) <= apart &&
-           ABS(object.y - b.hulls[a].y) <= apart;
+    float apart = b.slots[a].extent + 1.5f * object.size + reach;
+    return o.object_bodies[k] < 0 && is_obstacle(object) &&
+           ABS(object.x - b.slots[a].hull.x) <= apart && ABS(object.y - b.slots[a].hull.y) <= apart;
 }
 
 // Returns 1 if two slots may touch while nothing moves further than `reach`.
 HD int may_touch(const Bodies& b, int a, int c, float reach) {
-    float apart = b.extent[a] + b.extent[c] + 2.f * reach;
-    return ABS(b.hulls[c].x - b.hulls[a].x) <= apart && ABS(b.hulls[c].y - b.hulls[a].y) <= apart;
+    float apart = b.slots[a].extent + b.slots[c].extent + 2.f * reach;
+    return ABS(b.slots[c].hull.x - b.slots[a].hull.x) <= apart &&
+           ABS(b.slots[c].hull.y - b.slots[a].hull.y) <= apart;
 }
 
 // Leaves out slots that rest and that nothing may touch in this step: which nothing that moves may
@@ -238,19 +253,19 @@ template <class Group>
 HD void leave_out_sleepers(const Group& group, Bodies& b, int n_slots, float reach) {
     unsigned int awake = 0;  // a bit for each slot
     for (int i = group.rank; i < n_slots; i += Group::SIZE)
-        awake |= (b.speeds[i] > 0.f ? 1u : 0u) << i;
+        awake |= (b.slots[i].speed > 0.f ? 1u : 0u) << i;
     awake = reduce_or(group, awake);
     for (unsigned int woken = awake; woken; awake |= woken) {
         unsigned int wakes = 0;
         for (int i = group.rank; i < n_slots; i += Group::SIZE) {
-            unsigned int left = b.exists[i] && !(awake >> i & 1) ? woken : 0u;
+            unsigned int left = b.slots[i].exists && !(awake >> i & 1) ? woken : 0u;
             for (; left; left &= left - 1u)
                 if (may_touch(b, i, COUNT_BITS((left & (0u - left)) - 1u), reach))
                     wakes |= 1u << i;
         }
         woken = reduce_or(group, wakes);
     }
-    each(group, 0, n_slots, [&](int i) { b.exists[i] &= awake >> i & 1; });
+    each(group, 0, n_slots, [&](int i) { b.slots[i].exists &= awake >> i & 1; });
 }
 
 // Lists all pairs that may touch while nothing moves further than `reach`. Returns their number.
@@ -261,19 +276,20 @@ HD int find_candidates(const PhysicsBodiesParams& p, const Group& group, Bodies&
     Walls walls = walls_of(s, layout_of(s, env, p.error_flag));
     int n_slots = n_slots_of(p), n = 0;
     for (int a = 0; a < n_slots; a++) {
-        if (!b.exists[a])
+        if (!b.slots[a].exists)
             continue;
-        const Hull& hull = b.hulls[a];
-        float apart = b.extent[a] + reach;
-        int elevated = b.elevated[a];
+        const Hull& hull = b.slots[a].hull;
+        float apart = b.slots[a].extent + reach;
+        int elevated = b.slots[a].elevated;
         for (int start = a + 1; start < n_slots; start += Group::SIZE) {
             int c = start + group.rank, has = c < n_slots;
             if (has)
-                has = b.exists[c] && (b.inv_mass[a] > 0.f || b.inv_mass[c] > 0.f) &&
+                has = b.slots[c].exists &&
+                      (b.slots[a].inv_mass > 0.f || b.slots[c].inv_mass > 0.f) &&
                       may_touch(b, a, c, reach) && !passes_slot(elevated, c, s.n_agents);
             add_candidate(group, b, has, a, SLOT, c, n);
         }
-        if (b.inv_mass[a] == 0.f)
+        if (b.slots[a].inv_mass == 0.f)
             continue;
         for (int start = walls.first_box; start < walls.end_box; start += Group::SIZE) {
             int i = start + group.rank, meets = 0;
@@ -314,7 +330,7 @@ HD Hull other_hull(const PhysicsBodiesParams& p, const Bodies& b, int env, int c
                    int is_before) {
     int kind = candidate >> 5 & 3, index = candidate >> 7;
     if (kind == SLOT)
-        return is_before ? b.before[index] : b.hulls[index];
+        return is_before ? b.slots[index].before : b.slots[index].hull;
     const SceneryParams& s = p.scenery;
     if (kind == WALL) {
         int layout = layout_of(s, env, p.error_flag);
@@ -338,17 +354,17 @@ HD int passes(const Hull& old, const Hull& now, const Hull& wall) {
 HD int mark_overlap(const PhysicsBodiesParams& p, Bodies& b, int env, int candidate, const Touch& t,
                     const Hull& other) {
     int a = candidate & 31, kind = candidate >> 5 & 3, index = candidate >> 7;
-    int is_fixed = b.taken_back[a] && (kind != SLOT || b.taken_back[index]);
-    int is_through = kind != SLOT && passes(b.before[a], b.hulls[a], other);
+    int is_fixed = b.slots[a].taken_back && (kind != SLOT || b.slots[index].taken_back);
+    int is_through = kind != SLOT && passes(b.slots[a].before, b.slots[a].hull, other);
     float gap = gap_of(t);
     if (is_fixed || (gap >= -MAX_OVERLAP && !is_through))
         return 0;
     Hull old = other_hull(p, b, env, candidate, 1);
-    if (!is_through && gap >= gap_of(touch(b.before[a], old)) - 1e-6f)
+    if (!is_through && gap >= gap_of(touch(b.slots[a].before, old)) - 1e-6f)
         return 0;
-    b.overlaps[a] = 1;
+    b.slots[a].overlaps = 1;
     if (kind == SLOT)
-        b.overlaps[index] = 1;
+        b.slots[index].overlaps = 1;
     return 1;
 }
 
@@ -356,16 +372,16 @@ HD int mark_overlap(const PhysicsBodiesParams& p, Bodies& b, int env, int candid
 // all earlier touches of its slots.
 HD void number_levels(Bodies& b, int n_slots, int n_touches) {
     for (int i = 0; i < n_slots && n_touches; i++)
-        b.last[i] = 0;
+        b.slots[i].last = 0;
     b.n_levels = 0;
     for (int k = 0; k < n_touches; k++) {
         int a = b.touch_a[k], c = b.touch_b[k];
-        int moves_a = b.inv_mass[a] > 0.f, moves_c = c >= 0 && b.inv_mass[c] > 0.f;
-        int level = maxi(moves_a ? b.last[a] : 0, moves_c ? b.last[c] : 0) + 1;
+        int moves_a = b.slots[a].inv_mass > 0.f, moves_c = c >= 0 && b.slots[c].inv_mass > 0.f;
+        int level = maxi(moves_a ? b.slots[a].last : 0, moves_c ? b.slots[c].last : 0) + 1;
         if (moves_a)
-            b.last[a] = level;
+            b.slots[a].last = level;
         if (moves_c)
-            b.last[c] = level;
+            b.slots[c].last = level;
         b.levels[k] = level;
         b.n_levels = maxi(b.n_levels, level);
     }
@@ -374,7 +390,7 @@ HD void number_levels(Bodies& b, int n_slots, int n_touches) {
 // Returns 1 if a candidate overlaps, beyond the slop, or has passed through a wall.
 HD int is_bad(const Bodies& b, int candidate, const Touch& t, const Hull& other) {
     int a = candidate & 31, kind = candidate >> 5 & 3;
-    return gap_of(t) < -SLOP || (kind != SLOT && passes(b.before[a], b.hulls[a], other));
+    return gap_of(t) < -SLOP || (kind != SLOT && passes(b.slots[a].before, b.slots[a].hull, other));
 }
 
 // Finds the candidates that are within reach, per slot, of touching. With `checks`, also marks
@@ -391,7 +407,7 @@ HD int find_touches(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
             candidate = b.candidates[start + group.rank];
             int a = candidate & 31, is_slot = (candidate >> 5 & 3) == SLOT;
             Hull other = other_hull(p, b, env, candidate, 0);
-            t = touch(b.hulls[a], other);
+            t = touch(b.slots[a].hull, other);
             any |= checks ? mark_overlap(p, b, env, candidate, t, other)
                           : is_bad(b, candidate, t, other);
             has = gap_of(t) < (is_slot ? 2.f * reach : reach);
@@ -415,31 +431,32 @@ HD int find_touches(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
 
 // How much an impulse moves a slot. Agents give way to all else when overlaps end, so that bodies
 // at rest, which friction holds, stay where they are.
-HD float inverse_of(const Bodies& b, int slot, int n_agents, int is_shift) {
-    return is_shift && slot < n_agents ? LIGHT * b.inv_mass[slot] : b.inv_mass[slot];
+HD float inverse_of(const Slot& slot, int is_agent, int is_shift) {
+    return is_shift && is_agent ? LIGHT * slot.inv_mass : slot.inv_mass;
 }
 
-HD void push(const Bodies& b, Motion& motion, int slot, float inverse, float jx, float jy,
-             float turn) {
+HD void push(const Slot& slot, Motion& motion, float inverse, float jx, float jy, float turn) {
     if (!(inverse > 0.f))
         return;
-    motion.x[slot] += inverse * jx;
-    motion.y[slot] += inverse * jy;
-    motion.turn[slot] += b.inv_inertia[slot] * turn;
+    motion.x += inverse * jx;
+    motion.y += inverse * jy;
+    motion.turn += slot.inv_inertia * turn;
 }
 
 // Solves a touch: changes its slots' motions, which last h seconds, by impulses along the normal,
 // never below 0 in sum, after which no point overlaps, or more than SLOP if these are shifts. Two
 // points are solved together, exactly.
 RARE void solve_touch(Bodies& b, int k, int n_agents, float inv_h, int is_shift) {
-    Motion& m = is_shift ? b.shift : b.velocity;
     int a = b.touch_a[k], c = b.touch_b[k];
     const Touch& t = b.touches[k];
-    float mass_a = inverse_of(b, a, n_agents, is_shift), inertia_a = b.inv_inertia[a];
-    float mass_c = c < 0 ? 0.f : inverse_of(b, c, n_agents, is_shift);
-    float inertia_c = c < 0 ? 0.f : b.inv_inertia[c], turn_c = c < 0 ? 0.f : m.turn[c];
-    float x = (c < 0 ? 0.f : m.x[c]) - m.x[a], y = (c < 0 ? 0.f : m.y[c]) - m.y[a];
-    float turn_a = inertia_a > 0.f ? m.turn[a] : 0.f;  // a disc's turning moves no point of touch
+    Slot &slot = b.slots[a], &other = b.slots[maxi(c, 0)];  // without a slot c, unused
+    Motion& m = is_shift ? slot.shift : slot.velocity;
+    Motion& of_other = is_shift ? other.shift : other.velocity;
+    float mass_a = inverse_of(slot, a < n_agents, is_shift), inertia_a = slot.inv_inertia;
+    float mass_c = c < 0 ? 0.f : inverse_of(other, c < n_agents, is_shift);
+    float inertia_c = c < 0 ? 0.f : other.inv_inertia, turn_c = c < 0 ? 0.f : of_other.turn;
+    float x = (c < 0 ? 0.f : of_other.x) - m.x, y = (c < 0 ? 0.f : of_other.y) - m.y;
+    float turn_a = inertia_a > 0.f ? m.turn : 0.f;  // a disc's turning moves no point of touch
     float along = t.nx * x + t.ny * y, both = mass_a + mass_c;
     float old[2] = {b.impulses[k][0], b.impulses[k][1]}, mass[2], target[2];
     float between =
@@ -481,124 +498,124 @@ RARE void solve_touch(Bodies& b, int k, int n_agents, float inv_h, int is_shift)
     b.impulses[k][0] = first;
     b.impulses[k][1] = second;
     if (first > 0.f || second > 0.f) {
-        b.hit[a] = 1;
+        slot.hit = 1;
         if (c >= 0)
-            b.hit[c] = 1;
+            other.hit = 1;
     }
     float d1 = first - old[0], d2 = second - old[1], sum = d1 + d2;
-    push(b, m, a, mass_a, -sum * t.nx, -sum * t.ny, -(d1 * t.arms_a[0] + d2 * t.arms_a[1]));
+    push(slot, m, mass_a, -sum * t.nx, -sum * t.ny, -(d1 * t.arms_a[0] + d2 * t.arms_a[1]));
     if (c >= 0)
-        push(b, m, c, mass_c, sum * t.nx, sum * t.ny, d1 * t.arms_b[0] + d2 * t.arms_b[1]);
+        push(other, of_other, mass_c, sum * t.nx, sum * t.ny, d1 * t.arms_b[0] + d2 * t.arms_b[1]);
 }
 
 // Keeps what is held where it was grabbed, in its holder's frame, by at most `grip` newtons.
-HD void solve_hold(Bodies& b, int k, int slot, float h, float grip) {
-    int a = b.holders[slot];
-    float* impulse = b.hold[k];
-    if (a < 0)
+HD void solve_hold(Bodies& b, Slot& slot, float h, float grip) {
+    if (slot.holder < 0)
         return;
-    Motion& m = b.velocity;
-    const Hull &agent = b.hulls[a], &body = b.hulls[slot];
-    float mass_a = b.inv_mass[a], mass = b.inv_mass[slot], inertia = b.inv_inertia[slot];
-    float rx = agent.cosine * b.hold_x[k] - agent.sine * b.hold_y[k];
-    float ry = agent.sine * b.hold_x[k] + agent.cosine * b.hold_y[k];
+    Slot& holder = b.slots[slot.holder];
+    float* impulse = slot.hold;
+    Motion &m = slot.velocity, &of_holder = holder.velocity;
+    const Hull &agent = holder.hull, &body = slot.hull;
+    float mass_a = holder.inv_mass, mass = slot.inv_mass, inertia = slot.inv_inertia;
+    float rx = agent.cosine * slot.hold_x - agent.sine * slot.hold_y;
+    float ry = agent.sine * slot.hold_x + agent.cosine * slot.hold_y;
     float rate = 0.2f / h;  // at which what is out of place comes back
-    float off = wrap_degrees(b.angles[slot] - b.angles[a] - b.hold_turn[k]) * RADIANS;
+    float off = wrap_degrees(slot.angle - holder.angle - slot.hold_turn) * RADIANS;
     float limit = grip * h, max_turn = limit * SQRT(mass / inertia);
-    float turn = impulse[2] - (m.turn[slot] - m.turn[a] + rate * off) / inertia;
+    float turn = impulse[2] - (m.turn - of_holder.turn + rate * off) / inertia;
     turn = clamp(turn, -max_turn, max_turn);
-    push(b, m, slot, mass, 0.f, 0.f, turn - impulse[2]);
+    push(slot, m, mass, 0.f, 0.f, turn - impulse[2]);
     impulse[2] = turn;
-    float vx = m.x[slot] - m.x[a] + m.turn[a] * ry + rate * (body.x - agent.x - rx);
-    float vy = m.y[slot] - m.y[a] - m.turn[a] * rx + rate * (body.y - agent.y - ry);
+    float vx = m.x - of_holder.x + of_holder.turn * ry + rate * (body.x - agent.x - rx);
+    float vy = m.y - of_holder.y - of_holder.turn * rx + rate * (body.y - agent.y - ry);
     float jx = impulse[0] - vx / (mass_a + mass), jy = impulse[1] - vy / (mass_a + mass);
     float size = SQRT(jx * jx + jy * jy), scale = size > limit ? limit / size : 1.f;
     jx *= scale;
     jy *= scale;
-    push(b, m, slot, mass, jx - impulse[0], jy - impulse[1], 0.f);
-    push(b, m, a, mass_a, impulse[0] - jx, impulse[1] - jy, 0.f);
+    push(slot, m, mass, jx - impulse[0], jy - impulse[1], 0.f);
+    push(holder, of_holder, mass_a, impulse[0] - jx, impulse[1] - jy, 0.f);
     impulse[0] = jx;
     impulse[1] = jy;
 }
 
 // The floor's impulse on a slot: it brings the slot to the velocity that it wishes, which of a body
 // is none, by at most so much force, and for bodies torque.
-HD void solve_drag(Bodies& b, int i, float h) {
-    if (!(b.inv_mass[i] > 0.f) || !(b.drag[i] > 0.f))
+HD void solve_drag(Slot& slot, float h) {
+    if (!(slot.inv_mass > 0.f) || !(slot.drag > 0.f))
         return;
-    Motion& m = b.velocity;
-    float limit = b.drag[i] * h, mass = b.inv_mass[i], inertia = b.inv_inertia[i];
-    float jx = b.drag_x[i] + (b.wish_x[i] - m.x[i]) / mass;
-    float jy = b.drag_y[i] + (b.wish_y[i] - m.y[i]) / mass;
+    Motion& m = slot.velocity;
+    float limit = slot.drag * h, mass = slot.inv_mass, inertia = slot.inv_inertia;
+    float jx = slot.drag_x + (slot.wish_x - m.x) / mass;
+    float jy = slot.drag_y + (slot.wish_y - m.y) / mass;
     float size = SQRT(jx * jx + jy * jy);
     if (size > limit) {
         jx *= limit / size;
         jy *= limit / size;
-        m.x[i] += mass * (jx - b.drag_x[i]);
-        m.y[i] += mass * (jy - b.drag_y[i]);
+        m.x += mass * (jx - slot.drag_x);
+        m.y += mass * (jy - slot.drag_y);
     } else {
-        m.x[i] = b.wish_x[i];
-        m.y[i] = b.wish_y[i];
+        m.x = slot.wish_x;
+        m.y = slot.wish_y;
     }
-    b.drag_x[i] = jx;
-    b.drag_y[i] = jy;
+    slot.drag_x = jx;
+    slot.drag_y = jy;
     if (!(inertia > 0.f))
         return;
     float torque = limit * ARM * SQRT(mass / inertia);
-    float turn = b.drag_turn[i] - m.turn[i] / inertia;
+    float turn = slot.drag_turn - m.turn / inertia;
     if (ABS(turn) > torque) {
         turn = signed_as(torque, turn);
-        m.turn[i] += inertia * (turn - b.drag_turn[i]);
+        m.turn += inertia * (turn - slot.drag_turn);
     } else {
-        m.turn[i] = 0.f;
+        m.turn = 0.f;
     }
-    b.drag_turn[i] = turn;
+    slot.drag_turn = turn;
 }
 
-HD void begin_substep(Bodies& b, int i, int n_agents) {
-    b.drag_x[i] = b.drag_y[i] = b.drag_turn[i] = 0.f;
-    b.before[i] = b.hulls[i];
-    b.angles_before[i] = b.angles[i];
-    b.overlaps[i] = b.taken_back[i] = 0;
-    for (int k = 0; k < 3 && i >= n_agents; k++)
-        b.hold[i - n_agents][k] = 0.f;
+HD void begin_substep(Slot& slot) {
+    slot.drag_x = slot.drag_y = slot.drag_turn = 0.f;
+    slot.before = slot.hull;
+    slot.angle_before = slot.angle;
+    slot.overlaps = slot.taken_back = 0;
+    for (int k = 0; k < 3; k++)
+        slot.hold[k] = 0.f;
 }
 
 // Moves a slot for h seconds, or for less: no point of it moves faster than `limit`.
-HD void displace(Bodies& b, int i, const Motion& m, float h, float limit) {
-    if (!(b.inv_mass[i] > 0.f))
+HD void displace(Slot& slot, const Motion& m, float h, float limit) {
+    if (!(slot.inv_mass > 0.f))
         return;
-    float turn = b.inv_inertia[i] > 0.f ? m.turn[i] : 0.f;
-    float speed = speed_of(m.x[i], m.y[i], turn, b.extent[i]);
+    float turn = slot.inv_inertia > 0.f ? m.turn : 0.f;
+    float speed = speed_of(m.x, m.y, turn, slot.extent);
     if (speed > limit)
         h *= limit / speed;
-    b.hulls[i].x += h * m.x[i];
-    b.hulls[i].y += h * m.y[i];
-    if (m.turn[i] != 0.f) {
-        b.angles[i] += h * (m.turn[i] * DEGREES);
-        sincos_degrees(b.angles[i], b.hulls[i].sine, b.hulls[i].cosine);
+    slot.hull.x += h * m.x;
+    slot.hull.y += h * m.y;
+    if (m.turn != 0.f) {
+        slot.angle += h * (m.turn * DEGREES);
+        sincos_degrees(slot.angle, slot.hull.sine, slot.hull.cosine);
     }
 }
 
 // Puts a slot back to where it was before the substep, at rest. An agent still turns.
-HD void take_back(Bodies& b, int i, int n_agents) {
-    if (!b.overlaps[i] || b.taken_back[i])
+HD void take_back(Slot& slot, int is_agent) {
+    if (!slot.overlaps || slot.taken_back)
         return;
-    b.taken_back[i] = 1;
-    b.hit[i] = 1;
-    b.hulls[i].x = b.before[i].x;
-    b.hulls[i].y = b.before[i].y;
-    b.velocity.x[i] = b.velocity.y[i] = 0.f;
-    if (i < n_agents)
+    slot.taken_back = 1;
+    slot.hit = 1;
+    slot.hull.x = slot.before.x;
+    slot.hull.y = slot.before.y;
+    slot.velocity.x = slot.velocity.y = 0.f;
+    if (is_agent)
         return;
-    b.hulls[i] = b.before[i];
-    b.angles[i] = b.angles_before[i];
-    b.velocity.turn[i] = 0.f;
+    slot.hull = slot.before;
+    slot.angle = slot.angle_before;
+    slot.velocity.turn = 0.f;
 }
 
-HD void add_load(Bodies& b, int k) {
-    b.load[k] += SQRT(b.hold[k][0] * b.hold[k][0] + b.hold[k][1] * b.hold[k][1]);
-    b.load_turn[k] += ABS(b.hold[k][2]);
+HD void add_load(Slot& slot) {
+    slot.load += SQRT(slot.hold[0] * slot.hold[0] + slot.hold[1] * slot.hold[1]);
+    slot.load_turn += ABS(slot.hold[2]);
 }
 
 template <class Group>
@@ -619,64 +636,66 @@ HD void solve(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n
     int n_agents = p.scenery.n_agents, n_slots = n_slots_of(p);
     int n_iterations = n_touches || holds ? ITERATIONS : 1;  // one has the floor's impulses
     for (int i = 0; i < n_iterations; i++) {
-        each(group, 0, n_agents, [&](int a) { solve_drag(b, a, h); });
+        each(group, 0, n_agents, [&](int a) { solve_drag(b.slots[a], h); });
         if (holds) {
             if (group.rank == 0)
                 for (int k = 0; k < p.objects.n_bodies; k++)
-                    solve_hold(b, k, n_agents + k, h, p.grip);
+                    solve_hold(b, b.slots[n_agents + k], h, p.grip);
             sync(group);
         }
         solve_touches(p, group, b, n_touches, 1.f / h, 0);
-        each(group, n_agents, n_slots, [&](int k) { solve_drag(b, k, h); });
+        each(group, n_agents, n_slots, [&](int k) { solve_drag(b.slots[k], h); });
     }
     for (int k = n_agents + group.rank; k < n_slots && holds; k += Group::SIZE)
-        add_load(b, k - n_agents);
+        add_load(b.slots[k]);
 }
 
 template <class Group>
 HD void end_overlaps(const PhysicsBodiesParams& p, const Group& group, Bodies& b, int n_touches) {
     int n_slots = n_slots_of(p);
-    each(group, 0, n_slots, [&](int i) { b.shift.x[i] = b.shift.y[i] = b.shift.turn[i] = 0.f; });
+    each(group, 0, n_slots,
+         [&](int i) { b.slots[i].shift.x = b.slots[i].shift.y = b.slots[i].shift.turn = 0.f; });
     for (int i = 0; i < ITERATIONS; i++)
         solve_touches(p, group, b, n_touches, 1.f, 1);
-    each(group, 0, n_slots, [&](int i) { displace(b, i, b.shift, 1.f, MAX_SHIFT); });
+    each(group, 0, n_slots, [&](int i) { displace(b.slots[i], b.slots[i].shift, 1.f, MAX_SHIFT); });
 }
 
 // Writes what an agent did, and the fraction of what it wished, as `physics` does.
 HD void end_agent(const PhysicsBodiesParams& p, const Bodies& b, int env, int a) {
+    const Slot& slot = b.slots[a];
     int i = env * p.scenery.n_agents + a;
     float *position = p.positions + 2 * i, *velocity = p.velocity + 2 * i;
-    float wish_x = b.wish_x[a] * p.seconds, wish_y = b.wish_y[a] * p.seconds;
+    float wish_x = slot.wish_x * p.seconds, wish_y = slot.wish_y * p.seconds;
     float wish2 = wish_x * wish_x + wish_y * wish_y;
-    float moved = (b.hulls[a].x - position[0]) * wish_x + (b.hulls[a].y - position[1]) * wish_y;
-    p.progress[i] = b.hit[a] && wish2 > 0.f ? clamp(moved / wish2, 0.f, SHORTENING) : 1.f;
-    position[0] = b.hulls[a].x;
-    position[1] = b.hulls[a].y;
-    velocity[0] = b.velocity.x[a];
-    velocity[1] = b.velocity.y[a];
-    p.angles[i] = wrap_degrees(b.angles[a]);
+    float moved = (slot.hull.x - position[0]) * wish_x + (slot.hull.y - position[1]) * wish_y;
+    p.progress[i] = slot.hit && wish2 > 0.f ? clamp(moved / wish2, 0.f, SHORTENING) : 1.f;
+    position[0] = slot.hull.x;
+    position[1] = slot.hull.y;
+    velocity[0] = slot.velocity.x;
+    velocity[1] = slot.velocity.y;
+    p.angles[i] = wrap_degrees(slot.angle);
     flag_nonfinite(p.error_flag, env, position[0], position[1], p.angles[i]);
 }
 
 // Writes how a body moved. Its holder lets go if it had to use all its force, on average.
 HD void end_body(const PhysicsBodiesParams& p, const Bodies& b, int env, int k) {
     const ObjectsParams& o = p.objects;
-    int slot = p.scenery.n_agents + k;
+    const Slot& slot = b.slots[p.scenery.n_agents + k];
     Body& body = bodies_of(o)[env * o.n_bodies + k];
     float limit = 0.99f * p.grip * p.seconds;
-    float arm = SQRT(b.inv_mass[slot] / b.inv_inertia[slot]);
-    int slips = b.load[k] >= limit || b.load_turn[k] >= limit * arm;
-    body.holder = slips ? -1 : b.holders[slot];
-    if (!(b.inv_mass[slot] > 0.f))
+    float arm = SQRT(slot.inv_mass / slot.inv_inertia);
+    int slips = slot.load >= limit || slot.load_turn >= limit * arm;
+    body.holder = slips ? -1 : slot.holder;
+    if (!(slot.inv_mass > 0.f))
         return;
     Object& object = objects_of(o)[env * o.n_objects + object_of_body(o, k)];
-    object.x = b.hulls[slot].x;
-    object.y = b.hulls[slot].y;
-    if (b.angles[slot] != object.angle)
-        object.angle = wrap_degrees(b.angles[slot]);
-    body.vx = b.velocity.x[slot];
-    body.vy = b.velocity.y[slot];
-    body.turning = b.velocity.turn[slot] * DEGREES;
+    object.x = slot.hull.x;
+    object.y = slot.hull.y;
+    if (slot.angle != object.angle)
+        object.angle = wrap_degrees(slot.angle);
+    body.vx = slot.velocity.x;
+    body.vy = slot.velocity.y;
+    body.turning = slot.velocity.turn * DEGREES;
 }
 
 template <class Group>
@@ -687,32 +706,33 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
             begin_agent(p, b, env, i);
         else
             begin_body(p, b, env, i - n_agents);
-        b.hit[i] = b.overlaps[i] = b.elevated[i] = 0;
-        b.before[i] = b.hulls[i];
+        b.slots[i].hit = b.slots[i].overlaps = b.slots[i].elevated = 0;
+        b.slots[i].before = b.slots[i].hull;
     });
     if (p.objects.elevated) {
         int* elevated = p.objects.elevated + env * n_agents;
         each(group, 0, n_agents, [&](int a) {
             elevated[a] = elevation_of(p, b, env, a);
-            b.elevated[a] = mini(elevated[a], 1);
+            b.slots[a].elevated = mini(elevated[a], 1);
         });
     }
     unsigned int any = 0;
     for (int k = group.rank; k < n_slots - n_agents; k += Group::SIZE) {
         begin_hold(p, b, env, k);
-        any |= b.holders[n_agents + k] >= 0;
+        any |= b.slots[n_agents + k].holder >= 0;
     }
     int holds = reduce_or(group, any) != 0;
     sync(group);
-    each(group, 0, n_slots, [&](int i) { b.speeds[i] = top_speed(b, i, n_agents); });
+    each(group, 0, n_slots, [&](int i) { b.slots[i].speed = top_speed(b, i, n_agents); });
     float top = 0.f;
     for (int i = 0; i < n_slots; i++)
-        top = maxf(top, b.speeds[i]);
+        top = maxf(top, b.slots[i].speed);
     if (top == 0.f) {  // all rest
         for (int a = group.rank; a < n_agents; a += Group::SIZE)
             p.progress[env * n_agents + a] = 1.f;
         for (int k = group.rank; k < n_slots - n_agents; k += Group::SIZE)
-            bodies_of(p.objects)[env * p.objects.n_bodies + k].holder = b.holders[n_agents + k];
+            bodies_of(p.objects)[env * p.objects.n_bodies + k].holder =
+                b.slots[n_agents + k].holder;
         return;
     }
     float limit = top + MIN_LIMIT, h = p.seconds * (1.f / SUBSTEPS);
@@ -721,15 +741,15 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
     int n_candidates = find_candidates(p, group, b, env, SUBSTEPS * reach), n_touches;
     sync(group);
     each(group, 0, n_slots, [&](int i) {
-        if (b.overlaps[i]) {  // in a pair that is not listed
-            b.inv_mass[i] = b.inv_inertia[i] = 0.f;
-            b.velocity.x[i] = b.velocity.y[i] = 0.f;
+        if (b.slots[i].overlaps) {  // in a pair that is not listed
+            b.slots[i].inv_mass = b.slots[i].inv_inertia = 0.f;
+            b.slots[i].velocity.x = b.slots[i].velocity.y = 0.f;
         }
     });
     for (int substep = 0, checks = 0;;) {
         int is_bad = find_touches(p, group, b, env, n_candidates, reach, checks, n_touches);
         if (checks && is_bad) {  // shifts were not enough
-            each(group, 0, n_slots, [&](int i) { take_back(b, i, n_agents); });
+            each(group, 0, n_slots, [&](int i) { take_back(b.slots[i], i < n_agents); });
             continue;
         }
         if (is_bad && !checks && substep > 0) {
@@ -741,9 +761,10 @@ HD void move_bodies(const PhysicsBodiesParams& p, const Group& group, Bodies& b,
             break;
         substep++;
         checks = 0;
-        each(group, 0, n_slots, [&](int i) { begin_substep(b, i, n_agents); });
+        each(group, 0, n_slots, [&](int i) { begin_substep(b.slots[i]); });
         solve(p, group, b, n_touches, h, holds);
-        each(group, 0, n_slots, [&](int i) { displace(b, i, b.velocity, h, limit); });
+        each(group, 0, n_slots,
+             [&](int i) { displace(b.slots[i], b.slots[i].velocity, h, limit); });
     }
     for (int i = group.rank; i < n_slots; i += Group::SIZE)
         if (i < n_agents)
