@@ -267,9 +267,12 @@ HD void hideandseek_env(const HideAndSeekStepParams& p, const Group& group, int 
     if (group.rank == 0 && reset)
         start_episode(p, env, layout);
     else if (group.rank == 0 && p.actions)
-        for (int a = 0; a < n_agents; a++)
-            if (p.actions[first + a] >= GRAB && (a < p.n_hiders || old_age >= p.prep))
-                use_hand(p, walls, env, a, p.actions[first + a] == LOCK);
+        for (int a = 0; a < n_agents; a++) {
+            long long action = p.actions[first + a];
+            int is_hand = action == GRAB || action == LOCK;
+            if (is_hand && (a < p.n_hiders || old_age >= p.prep))
+                use_hand(p, walls, env, a, action == LOCK);
+        }
     sync(group);
     int age = reset ? 0 : old_age + 1, is_prep = age < p.prep, ends = !reset && age >= p.limit;
     unsigned int seen = is_prep ? 0u : find_seen(p, group, walls, env);
@@ -322,13 +325,16 @@ struct HideAndSeekMovesParams {
     int prep;
 };
 
-HD int is_move(const HideAndSeekMovesParams& p, int i) {
+// The action by which a lane moves. One outside of the action space stays, for physics to flag.
+HD long long move_of(const HideAndSeekMovesParams& p, int i) {
+    long long action = p.actions[i];
+    if (action < 0 || action > LOCK)
+        return action;
     int waits = p.ages[i] < p.prep && i % p.n_agents >= p.n_hiders;
-    return !p.ended[i] && !waits && p.actions[i] < GRAB;
+    return p.ended[i] || waits || action >= GRAB ? 0 : action;
 }
 
-EACH(hideandseek_moves, HideAndSeekMovesParams, p.n_lanes, 1,
-     p.out[i] = is_move(p, i) ? p.actions[i] : 0)
+EACH(hideandseek_moves, HideAndSeekMovesParams, p.n_lanes, 1, p.out[i] = move_of(p, i))
 
 // B lanes, R pixels. The images of seekers that wait are black.
 struct HideAndSeekImagesParams {
