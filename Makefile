@@ -10,8 +10,6 @@ SEED ?= 1
 # Neighbouring tests share a process, and what they prepare. Tests start many processes, which
 # import faster from bytecode.
 PYTEST = PYTHONDONTWRITEBYTECODE= $(PYTHON) -m pytest -q -n $(WORKERS) --dist worksteal
-# Which tests `make test` runs; .ci/run has the thorough ones in the same processes.
-TIER ?= not slow and not nightly
 
 # Create the virtual environment only if it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
@@ -25,7 +23,7 @@ train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen hom
 	$(PYTHON) train.py experiment=quickstart
 
 test: $(SETUP)             ## run the fast tests: 4 to 5 minutes on two cores
-	$(PYTEST) -m "$(TIER)"
+	$(PYTEST) -m "not slow and not nightly"
 
 test-slow: WORKERS := $(shell expr $(CORES) + 2)
 test-slow: $(SETUP)        ## run the thorough tests: 3 to 4 minutes

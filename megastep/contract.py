@@ -120,11 +120,13 @@ def check_world(env: Env, world: World, last: World | None = None) -> None:
 
 def _check_tensor(env, path, values, shape, dtypes, kind=None) -> None:
     """Requires a tensor of this shape, of one of the dtypes, on the environment's device."""
-    described, device, is_alike = repr(values), torch.device(env.device).type, False
+    device, is_alike = torch.device(env.device).type, False
     if isinstance(values, torch.Tensor):
         described = f"{values.dtype} {tuple(values.shape)} on {values.device.type}"
         is_alike = values.shape == shape and values.dtype in dtypes
         is_alike = is_alike and values.device.type == device
+    else:
+        described = repr(values)
     kind = kind or " or ".join(map(str, dtypes))
     _require(env, is_alike, f"{path} must be {kind} {tuple(shape)} on {device}, not {described}")
 
