@@ -11,7 +11,7 @@ _NAMES = [file.name for file in pkgutil.iter_modules(__path__) if file.name not 
 
 
 class _Envs(Mapping[str, type]):
-    """A module's environment is the first of its ``__all__``, its own name but for capitals."""
+    """A module's environment is the first of its ``__all__``: CartPole of ``cart_pole``."""
 
     def __getitem__(self, name: str) -> type:
         if name not in _NAMES:
@@ -33,7 +33,9 @@ ENVS = _Envs()
 def __getattr__(name) -> object:
     if name == "__all__":
         return ["ENVS", *sorted(env.__name__ for env in ENVS.values())]
-    if name.lower() not in _NAMES:
+    modules = {module.replace("_", ""): module for module in _NAMES}
+    if name.lower().replace("_", "") not in modules:
         raise AttributeError(f"megastep.envs has no {name}; its modules: {', '.join(_NAMES)}")
-    module = importlib.import_module(f"{__name__}.{name.lower()}")
-    return module if name in _NAMES else getattr(module, name)
+    module = modules[name.lower().replace("_", "")]
+    found = importlib.import_module(f"{__name__}.{module}")
+    return found if name == module else getattr(found, name)
