@@ -1,7 +1,7 @@
 """The gradient steps of an update. Non-finite steps are skipped and counted."""
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch.autograd.graph import _engine_run_backward as run_backward
@@ -10,14 +10,17 @@ from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.algorithms.optimizers import (
     NAMES,
+    THREADS,
     Adam,
     Factors,
     Imported,
     has_kernels,
+    launches,
     squared_norms,
 )
-from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
-from megastep.agents.networks.fused import fused
+from megastep.agents.distributed import pooling
+from megastep.agents.distributed.pooling import Moments, pool_with_condition
+from megastep.agents.networks.fused import fused, is_plain_on_gpu
 from megastep.agents.types import StateDict
 from megastep.kernels.build.launch import Blocks, launch
 
@@ -35,7 +38,7 @@ def _take_on_gpu(steps, is_enabled=True) -> torch.Tensor:
     grad_norm, is_taken = sums.new_empty(()), torch.empty_like(steps.is_finite)
     is_enabled = None if is_enabled is True else torch.as_tensor(is_enabled, device=device)
     launch(
-        *(LIBRARY, "judge", device, Blocks(1, threads=LIBRARY.constants["ADAM_THREADS"])),
+        *(LIBRARY, "judge", device, Blocks(1, threads=THREADS)),
         metrics=b"".join(LIBRARY.params.MetricParams(values=value) for value in metrics),
         **dict(sums=sums, is_finite=steps.is_finite, is_enabled=is_enabled),
         **dict(n_valid=steps.n_valid, n_steps=adam.n_steps, grad_norm=grad_norm),
@@ -50,6 +53,43 @@ def _take_on_gpu(steps, is_enabled=True) -> torch.Tensor:
 def _fits(steps, *_) -> bool:
     is_adam = isinstance(steps.optimizer, Adam) and has_kernels(steps.optimizer)
     return is_adam and len(steps.metrics) <= LIBRARY.constants["JUDGED_METRICS"]
+
+
+@torch.no_grad()
+def _average_on_gpu(
+    parameters, n_valid, means: Sequence[torch.Tensor] = ()
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Fills the bucket in one kernel, and divides it in another."""
+    device, n_valid = n_valid.device, n_valid.long()
+    held = [p for p in parameters if p.grad is not None]
+    sources = [*(p.grad for p in held), *(mean.detach().float() for mean in means)]
+    sizes = [x.numel() + -x.numel() % 4 for x in sources]
+    bucket = torch.empty(sum(sizes) + 1, device=device)
+    *parts, (total,) = bucket.split([*sizes, 1])
+    averages = [part[: x.numel()].view_as(x) for part, x in zip(parts, sources)]
+    rows = ((dict(source=x, target=average), {}) for x, average in zip(sources, averages))
+    for packed, n_blocks in launches(LIBRARY.params.BucketRowParams, rows):
+        launch(
+            *(LIBRARY, "pack", device, Blocks(n_blocks, threads=THREADS)),
+            **dict(rows=b"".join(packed), n_valid=n_valid, total=total, n_rows=len(packed)),
+        )
+    pooling.all_reduce(bucket)
+    n, n_pooled = sum(sizes), torch.empty_like(n_valid)
+    launch(
+        *(LIBRARY, "divide", device, Blocks(-(-n // (4 * THREADS)), threads=THREADS)),
+        **dict(bucket=bucket, total=total, n_valid=n_pooled, n=n),
+    )
+    for p, average in zip(held, averages):
+        p.grad = average
+    return n_pooled, averages[len(held) :]
+
+
+def _takes_average(parameters, n_valid, means=()) -> bool:
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    return pooling.n_pooled() > 1 and bool(gradients) and is_plain_on_gpu(*gradients)
+
+
+average_gradients = fused(_average_on_gpu, _takes_average, operation=pooling.average_gradients)
 
 
 @functools.cache

@@ -5,7 +5,7 @@ their gradients. PyTorch's takes ten times as long there for networks this small
 `torch.optim.Adam` imports PyTorch's compiler first, which takes more than a second.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 
 import torch
@@ -24,7 +24,7 @@ BETAS = 0.9, 0.999
 EPS = 1e-5
 Factors = Mapping[torch.nn.Parameter, float]
 _MAX_ROWS = LIBRARY.constants["ADAM_ROWS"]
-_THREADS = LIBRARY.constants["ADAM_THREADS"]
+THREADS = LIBRARY.constants["ADAM_THREADS"]
 _NONE = MappingProxyType({})
 
 
@@ -188,11 +188,11 @@ def has_kernels(adam: Adam) -> bool:
 
 def squared_norms(adam: Adam) -> torch.Tensor:
     """Returns (n,) numbers that add up to the square of the norm of all gradients."""
-    launches = list(_launches(adam))
-    sums, first_sum = adam.n_steps.new_empty(sum(n for _, n in launches)), 0
-    for rows, n_blocks in launches:
+    parts = list(_launches(adam))
+    sums, first_sum = adam.n_steps.new_empty(sum(n for _, n in parts)), 0
+    for rows, n_blocks in parts:
         launch(
-            *(LIBRARY, "squared_norm", sums.device, Blocks(n_blocks, threads=_THREADS)),
+            *(LIBRARY, "squared_norm", sums.device, Blocks(n_blocks, threads=THREADS)),
             **dict(rows=b"".join(rows), sums=sums, n_rows=len(rows), first_sum=first_sum),
         )
         first_sum += n_blocks
@@ -202,7 +202,7 @@ def squared_norms(adam: Adam) -> torch.Tensor:
 def _update_on_gpu(adam, is_taken, grad_norm, max_norm) -> None:
     for rows, n_blocks in _launches(adam):
         launch(
-            *(LIBRARY, "adam", adam.lr.device, Blocks(n_blocks, threads=_THREADS)),
+            *(LIBRARY, "adam", adam.lr.device, Blocks(n_blocks, threads=THREADS)),
             **dict(rows=b"".join(rows), n_rows=len(rows), lr=adam.lr, n_steps=adam.n_steps),
             **dict(grad_norm=grad_norm, is_taken=is_taken, max_norm=max_norm),
             **dict(beta1=BETAS[0], beta2=BETAS[1], eps=EPS),
@@ -210,17 +210,29 @@ def _update_on_gpu(adam, is_taken, grad_norm, max_norm) -> None:
 
 
 def _launches(adam) -> Iterator[tuple[list[bytes], int]]:
-    """Yields the packed rows of a launch and its number of blocks."""
-    rows, n_blocks = [], 0
-    for factor, weight_decay, members in adam.rows():
-        for p, gradient, mean, square in members:
-            if len(rows) == _MAX_ROWS:
-                yield rows, n_blocks
-                rows, n_blocks = [], 0
-            tensors = dict(parameter=p, gradient=gradient, mean=mean, square=square)
-            is_aligned = not any(x.data_ptr() % 16 for x in tensors.values())
-            fields = dict(n=p.numel(), first_block=n_blocks, is_aligned=int(is_aligned))
-            fields |= dict(lr_factor=factor, weight_decay=weight_decay)
-            rows.append(LIBRARY.params.AdamRowParams(**tensors, **fields))
-            n_blocks += max(1, -(-p.numel() // (4 * _THREADS)))
-    yield rows, n_blocks
+    names = "parameter", "gradient", "mean", "square"
+    rows = (
+        (dict(zip(names, tensors)), dict(lr_factor=factor, weight_decay=weight_decay))
+        for factor, weight_decay, members in adam.rows()
+        for tensors in members
+    )
+    return launches(LIBRARY.params.AdamRowParams, rows)
+
+
+def launches(
+    pack_row: Callable[..., bytes], rows: Iterable[tuple[dict[str, torch.Tensor], dict]]
+) -> Iterator[tuple[list[bytes], int]]:
+    """Yields the packed rows of a launch and its number of blocks. A row is its tensors, of equally
+    many numbers, and its other fields.
+    """
+    packed, n_blocks = [], 0
+    for tensors, fields in rows:
+        if len(packed) == _MAX_ROWS:
+            yield packed, n_blocks
+            packed, n_blocks = [], 0
+        n = next(iter(tensors.values())).numel()
+        is_aligned = int(not any(x.data_ptr() % 16 for x in tensors.values()))
+        place = dict(n=n, first_block=n_blocks, is_aligned=is_aligned)
+        packed.append(pack_row(**tensors, **place, **fields))
+        n_blocks += max(1, -(-n // (4 * THREADS)))
+    yield packed, n_blocks

@@ -60,15 +60,18 @@ def pool_moments(*moments: Moments) -> list[Moments]:
     own_counts, own_means, own_variances = zip(*moments)
     sizes = [mean.numel() for mean in own_means]
     statistics = torch.cat([column.flatten() for column in (*own_means, *own_variances)])
-    rows = all_gather(torch.cat([torch.stack(own_counts).double(), statistics.double()]))
+    numbers = torch.stack(own_counts)
+    rows = all_gather(torch.cat([numbers.double(), statistics.double()]))
     counts, means, variances = rows.split([len(sizes), sum(sizes), sum(sizes)], 1)
-    n = counts.sum(0)
+    n = counts.sum(0).to(numbers.dtype)
     # one count per entry of a mean
     columns = counts.split(1, 1)
     counts = torch.cat([column.expand(-1, size) for column, size in zip(columns, sizes)], 1)
     divisor = counts.sum(0).clamp(min=1)
     mean = (counts * means).sum(0) / divisor
     variance = (counts * (variances + (means - mean).square())).sum(0) / divisor
+    # all in one, and then those of another type
+    mean, variance = mean.to(statistics.dtype), variance.to(statistics.dtype)
     pooled = zip(n, mean.split(sizes), variance.split(sizes), strict=True)
     moments_of_all = [
         tuple(new.view_as(old).to(old.dtype) for new, old in zip(each, before, strict=True))

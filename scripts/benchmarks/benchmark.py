@@ -83,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
     parser.add_argument("--seeds", nargs="+", type=int, help="for train and ranks")
     parser.add_argument("--budgets", nargs="+", type=int, help="seconds, for train and ranks")
-    parser.add_argument("--envs", nargs="+", metavar="ENV", help="for scaling")
+    parser.add_argument("--envs", nargs="+", metavar="ENV", help="for scaling; or experiment=NAME")
     parser.add_argument("--seconds", type=int, metavar="S", help="of a run, for members")
     parser.add_argument("--commit", help="the commit to record, if git is not available")
     parser.add_argument(

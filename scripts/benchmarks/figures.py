@@ -14,6 +14,7 @@ ORIGINAL_MEGASTEP = 16_384, 0.86e6
 #: Explorer's mean return in test homes for seeing all that is visible from 128 points.
 NEARLY_ALL_SEEN = 59.1
 ENV_COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange", "pointgoal": "tab:purple"}
+ENV_COLOURS["memory_9"] = "tab:green"
 BUDGET_COLOURS = "tab:green", "tab:blue", "tab:red"
 
 

@@ -10,22 +10,26 @@ from records import ROOT
 from timing import measurement
 from training import rates, trained
 
-N_ROUNDS = 3
-#: What trains long enough for a steady rate; about 8 s on a GPU.
-SAMPLES = {"cuda": 150_000_000, "cpu": 100_000}
+N_ROUNDS = 2
+#: Per GPU, enough for several reports: 4 to 6 s.
+SAMPLES = {"cuda": 70_000_000, "cpu": 100_000}
+#: Environments with default settings, and an experiment.
+NAMES = "explorer", "pointgoal", "experiment=memory_9"
+NO_FINISH = "finish.evaluate=false", "finish.record=false"
 
 
 def scaling(device: torch.device, envs: list[str] | None = None) -> Iterator[dict]:
     """Samples per second of training with default settings per GPU, on one GPU and on 2, 4 and 8 as
-    far as there are, in turn, three times each; and the time of an all-reduce of the gradients.
+    far as there are, in turn, twice each; and the time of an all-reduce of the gradients.
     """
-    for env in map(str.lower, envs or ("Explorer", "PointGoal")):
+    for name in map(str.lower, envs or NAMES):
+        env = name.rpartition("=")[2]
         by_count = {n: [] for n in _counts(device)}
         for _ in range(N_ROUNDS):
             for n, found in by_count.items():
                 samples = n * SAMPLES[device.type]
-                words = f"env={env}", f"ranks={n}", f"samples={samples}", f"device={device.type}"
-                with trained(device, words) as (run,):
+                words = name if "=" in name else f"env={name}", f"ranks={n}", f"samples={samples}"
+                with trained(device, (*words, f"device={device.type}", *NO_FINISH)) as (run,):
                     found.append(statistics.median(rates(run)) / 1e6)
         one = statistics.median(by_count[1])
         for n, found in by_count.items():

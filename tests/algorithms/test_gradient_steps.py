@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from megastep.agents.algorithms.gradient_steps import GradientSteps
+from megastep.agents.algorithms.gradient_steps import GradientSteps, average_gradients
 from megastep.agents.algorithms.optimizers import BETAS, EPS, Adam, has_kernels
+from megastep.agents.distributed import pooling
 
 
 def updates(to=torch.Tensor.cpu):
@@ -59,6 +60,35 @@ def test_a_gpu_takes_the_same_steps(to_gpu):
         assert one == pytest.approx(other, rel=1e-4, nan_ok=True)
     for one, other in zip(tensors, of_cpu, strict=True):
         torch.testing.assert_close(one.cpu(), other, rtol=1e-4, atol=1e-5)
+
+
+def averages(patch, move=torch.clone):
+    """Returns what the second of two ranks gets: gradients, metrics and the number of entries."""
+    generator, buckets = torch.Generator().manual_seed(0), []
+
+    def all_reduce(bucket):
+        buckets.append(bucket.clone())
+        return bucket.copy_(sum(buckets))
+
+    patch.setattr(pooling, "all_reduce", all_reduce)
+    patch.setattr(pooling, "n_pooled", lambda: 2)
+    for n_valid in (3, 5):
+        numbers = [torch.randn(n + 1, generator=generator) for n in [*range(60), 5000]]
+        params = [torch.nn.Parameter(move(torch.zeros(n - n % 2))) for n in map(len, numbers)]
+        for p, gradient in zip(params[:-1], numbers):  # the last has none; odd ones begin anywhere
+            p.grad = move(gradient)[len(gradient) % 2 :]
+        metrics = [move(torch.randn((), generator=generator)) for _ in range(2)]
+        n, means = average_gradients(params, move(torch.tensor(n_valid)), metrics)
+    assert params[-1].grad is None
+    return [*(p.grad for p in params[:-1]), *means, n]
+
+
+def test_a_gpu_averages_gradients_as_a_cpu_does(to_gpu, monkeypatch):
+    """Bit for bit. Also with more parameters than fit into a launch."""
+    on_gpu, on_cpu = (averages(monkeypatch, move) for move in (to_gpu, torch.clone))
+    assert on_gpu[-1] == on_cpu[-1] == 8 and len(on_gpu) == 63
+    for one, other in zip(on_gpu, on_cpu, strict=True):
+        assert torch.equal(one.cpu().float(), other)
 
 
 # ---- Adam ----

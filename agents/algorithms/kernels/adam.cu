@@ -1,6 +1,6 @@
 // Adam with decoupled weight decay for many parameters in one launch, the norm of their gradients,
-// and whether a step is taken. A block handles neighbouring numbers of one parameter, a thread a
-// word of four.
+// whether a step is taken, and what ranks do with gradients before and after they sum them. A block
+// handles neighbouring numbers of one parameter, a thread a word of four.
 #include "common/numbers.h"
 #include "common/rows.h"
 #include "common/sums.h"
@@ -14,9 +14,10 @@ struct WordIndex {
     bool is_word;  // one instruction moves it
 };
 
-DEVICE WordIndex find_index(const AdamRowParams* rows, int n_rows) {
+template <class Row>
+DEVICE WordIndex find_index(const Row* rows, int n_rows) {
     int row = row_of_block(rows, n_rows);
-    const AdamRowParams& its = rows[row];
+    const Row& its = rows[row];
     unsigned int at = 4 * ((blockIdx.x - its.first_block) * ADAM_THREADS + threadIdx.x);
     int n = at < its.n ? (int)min(its.n - at, 4u) : 0;
     return {row, at, n, its.is_aligned && n == 4};
@@ -35,6 +36,33 @@ DEVICE void write_word(float* array, const WordIndex& index, const float (&value
     for (int i = 0; i < 4; i++)
         if (i < index.n)
             array[index.first + i] = values[i];
+}
+
+KERNEL __launch_bounds__(256) pack(PackParams p) {
+    wait_for_previous();
+    WordIndex index = find_index(p.rows, p.n_rows);
+    const BucketRowParams& row = p.rows[index.row];
+    float values[4], n_valid = *p.n_valid;
+    read_word(values, row.source, index);
+    for (int i = 0; i < 4; i++)
+        values[i] *= n_valid;
+    write_word(row.target, index, values);
+    if (!blockIdx.x && !threadIdx.x)
+        *p.total = n_valid;
+}
+
+// Follows NCCL's kernel, and does not start early.
+KERNEL __launch_bounds__(256) divide(DivideParams p) {
+    int at = 4 * (blockIdx.x * ADAM_THREADS + threadIdx.x);
+    float values[4], total = *p.total;
+    if (!at)
+        *p.n_valid = total;
+    if (at >= p.n)
+        return;
+    read<float>(values, p.bucket, at);
+    for (int i = 0; i < 4; i++)
+        values[i] /= fmaxf(total, 1.f);
+    write<float>(p.bucket, at, values);
 }
 
 KERNEL __launch_bounds__(256) squared_norm(SquaredNormParams p) {

@@ -115,6 +115,29 @@ struct AdamRowParams {
     float weight_decay;
 };
 
+// A gradient or a metric (n), and where it goes.
+struct BucketRowParams {
+    const float* source;
+    float* target;  // begins at a multiple of 16 bytes
+    unsigned int n;
+    unsigned int first_block;  // of the launch that handles it
+    int is_aligned;            // as above
+};
+
+struct PackParams {
+    BucketRowParams rows[ADAM_ROWS];
+    const long long* n_valid;  // (), the factor
+    float* total;              // (), n_valid
+    int n_rows;
+};
+
+struct DivideParams {
+    float* bucket;       // (n), divided by the total, if that is not 0
+    const float* total;  // (), of all ranks
+    long long* n_valid;  // (), written: the total
+    int n;               // a multiple of 4
+};
+
 struct SquaredNormParams {
     AdamRowParams rows[ADAM_ROWS];
     float* sums;  // (n_sums), of this launch's blocks from first_sum on
