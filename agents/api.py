@@ -81,10 +81,10 @@ class Run:
         agent, it has its critic: `run.policy.value(decision.features, world.privileged)` in worlds
         of `run.make(privileged=True)`; a critic that is not asymmetric takes the features alone.
         """
-        from megastep.agents import hardware  # with PyTorch
+        from megastep.agents.factory import make as factory  # with PyTorch
         from megastep.agents.runs import restore
 
-        device = hardware.make_device("auto")
+        device = factory.make_device("auto")
         loaded = folders.load_checkpoint(folders.find(str(self.path)), False, device)
         has_critic = any(name.startswith("critic.") for name in (loaded.state or {})["policy"])
         critic = self.config["agent"]["critic"] if has_critic else None
@@ -249,7 +249,7 @@ def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
             f"save takes the environment that megastep.make returned, got {type(env).__name__}; "
             "make one of the same settings, not what wraps it"
         )
-    if not agent_file.is_agent_file(path := Path(file)):
+    if (path := Path(file)).suffix != agent_file.SUFFIX:
         raise UserError(f"{path} must end with .safetensors")
     of_env, geometry, seed = made
     train = dict(env=check.as_tree(of_env), geometry=check.as_tree(geometry), seed=seed)

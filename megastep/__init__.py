@@ -43,19 +43,16 @@ _NAMES = {
     ),
     "UserError": "agents.errors",
 }
+_MODULES = [module.name for module in pkgutil.iter_modules(__path__) if module.name[0] != "_"]
 
 
 def __getattr__(name) -> "ModuleType":
     if name in _NAMES:
         return getattr(importlib.import_module(f"{__name__}.{_NAMES[name]}"), name)
-    if name in _modules():
+    if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
-    raise AttributeError(f"megastep has no module '{name}'; its modules: {', '.join(_modules())}")
-
-
-def _modules() -> list[str]:
-    return [module.name for module in pkgutil.iter_modules(__path__) if module.name[0] != "_"]
+    raise AttributeError(f"megastep has no module '{name}'; its modules: {', '.join(_MODULES)}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_modules(), *_NAMES})
+    return sorted({*globals(), *_MODULES, *_NAMES})

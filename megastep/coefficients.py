@@ -8,8 +8,6 @@ import torch
 
 from megastep.schedules import Number, called, schedule_of
 
-__all__ = ["Coefficients", "on_device"]
-
 
 class Coefficients:
     """Numbers that may change while training, also those that a CUDA graph reads.

@@ -11,8 +11,6 @@ import torch
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import BLOCK
 
-__all__ = ["device", "fit", "free_memory", "n_resident_threads", "set_threads", "threads"]
-
 #: GNU OpenMP ends the process if it cannot start as many as it is asked for.
 MAX_THREADS = max(1024, os.cpu_count() or 1)
 _n_threads = None  # None: as many as PyTorch

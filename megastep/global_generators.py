@@ -18,8 +18,6 @@ import numpy as np
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["KINDS", "GlobalGenerators", "Held", "kept"]
-
 KINDS = "numpy", "python", "torch"
 _NUMPY: Any = np.random  # whose types leave out the functions that exchange its bit generator
 

@@ -18,8 +18,6 @@ from megastep.read_only import SetOnce
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Ragged", "RaggedNumpy", "RaggedTorch"]
-
 Array = np.ndarray | torch.Tensor
 
 
@@ -89,7 +87,7 @@ class Ragged(SetOnce):
     def inverse(self) -> Any:
         """(V,) the subarray that each element of ``vals`` belongs to."""
         if isinstance(self, RaggedTorch):
-            return torch.arange(len(self), device=self.device).repeat_interleave(self.widths)
+            return torch.arange(len(self), device=self.vals.device).repeat_interleave(self.widths)
         return np.arange(len(self)).repeat(self.widths)
 
     @cached_property

@@ -6,8 +6,6 @@ import numpy as np
 import torch
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-__all__ = ["ReadOnlyTensor", "SetOnce"]
-
 _WRITING = ("__setitem__", "__delitem__", "__set__", "__delete__")
 # Names that start like in-place operators, but only read.
 _READING = ("__index__", "__int__", "__invert__", "__init__", "__init_subclass__", "__iter__")

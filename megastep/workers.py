@@ -10,8 +10,6 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
 
-__all__ = ["WORKER_ENV", "end_with_parent", "pool", "terminal_signals_blocked"]
-
 #: Environment variables of a worker process: one thread, no screen, and no GPU, because even an
 #: idle CUDA context takes half a gigabyte.
 WORKER_ENV = {

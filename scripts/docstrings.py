@@ -22,7 +22,7 @@ import megastep
 INTERNAL = re.compile(
     r"megastep\.(__main__|adapters\.(?!vector_env)\w+|atomic_files|cache|compat|cuda|colour|demo|global_generators|hosting|imports|kernels|moments"
     r"|web|agents\.(cli|console|export|distributed\.(?!pooling)"
-    r"\w+|factory|hardware|launch|package|pretrained|runs|networks\.(kernels|web|\w+_cpu)|storage\.\w*kernels"
+    r"\w+|factory|launch|package|pretrained|runs|networks\.(kernels|web|\w+_cpu)|storage\.\w*kernels"
     r"|algorithms\.kernels)|geometries\.homes\.\w+|envs\.\w+\.(?!(env|bot|tracker)\b)\w+|geodesics)\b"
 )
 

@@ -52,7 +52,7 @@ ENGINE = (
 AGENTS = (
     ("errors", "generator", "package", "types"),
     ("distributed",),
-    ("console", "hardware", "networks"),
+    ("console", "networks"),
     ("storage",),
     ("algorithms",),
     ("runs",),
@@ -94,8 +94,7 @@ SHARED_WITH_BOTS = SHARED | {
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
 # environments, keeps the global generators, writes videos and starts processes.
-UPPER_ROOMS = ("api", "cli", "evaluation", "export", "factory", "hardware", "launch")
-UPPER_ROOMS += ("pretrained", "reports")
+UPPER_ROOMS = ("api", "cli", "evaluation", "export", "factory", "launch", "pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",

@@ -18,7 +18,7 @@ HELP = """Verifies a run's checkpoints and prints what is in them.
 def run(run: str) -> int:
     """Inspects a run. Returns the exit code: 1 if one of its checkpoints is damaged."""
     path = folders.find(run)
-    is_agent, folder = agent_file.is_agent_file(path), folders.checkpoints_of(path)
+    is_agent, folder = path.suffix == agent_file.SUFFIX, folders.checkpoints_of(path)
     is_one = is_agent or folder == path
     paths = [path] if is_one else checkpoint.list_checkpoints(folder)
     if not paths:

@@ -79,7 +79,7 @@ def prepare(tree: Tree, typed: list[str]) -> Tree:
     allowed = [*allowed, *["ranks"] * whole]  # members have the same bits on any number of ranks
     if refused := [key for key in typed if not {key, key.split(".")[0]} & {*allowed}]:
         raise ConfigErrors((key, CURES[how]) for key in refused)
-    if how != "init" and agent_file.is_agent_file(path):
+    if how != "init" and path.suffix == agent_file.SUFFIX:
         raise UserError(
             f"{tree[how]} is a pretrained agent, which has the weights only. init={tree[how]} "
             f"starts a new run from it; {how}= takes the run's folder"

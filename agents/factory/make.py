@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from megastep import contract, engine, scene, spaces, types
+from megastep import contract, devices, engine, scene, spaces, types
 from megastep.agents.algorithms.learner import LearnerError, check_learner
+from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, components, settings
 from megastep.agents.factory.components import env_name, label
 from megastep.agents.factory.settings import Agent, Env, Geometry, Learner, Played, Train, Trained
 from megastep.agents.generator import stream_seed
-from megastep.agents.hardware import make_device as make_device
-from megastep.agents.hardware import share_threads
+from megastep.agents.networks.linear import share_threads
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.runs.saver import check_plain, nbytes
@@ -44,6 +44,20 @@ KINDS = (
 )
 #: Turns these errors into a UserError that begins with a prefix. For setting up.
 errors = functools.partial(user_errors, kinds=KINDS)
+
+
+def make_device(name: str) -> torch.device:
+    """Returns the device `auto`, `cpu`, `cuda`, of which each rank has its own, or `cuda:1`, and
+    makes a GPU the current one. Raises UserError if there is none.
+    """
+    with user_errors(kinds=(ValueError, engine.EngineError)):
+        info = environment.rank_info()
+        if info and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
+            name = f"cuda:{info.local_rank}"
+        device = devices.device(name)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)  # on which graphs are captured
+    return device
 
 
 def construct(settings: "Component", constructor: Callable | None = None, **arguments: Any) -> Any:

@@ -140,7 +140,7 @@ def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint:
     if cfg.resume and check_state:
         with state_errors(loaded.path):
             check_state((loaded.state or {})["learner"])  # before anything is written
-    if rank == 0 and policy.critic is not None and agent_file.is_agent_file(path):
+    if rank == 0 and policy.critic is not None and path.suffix == agent_file.SUFFIX:
         console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
     return loaded
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from megastep.agents.types import Config, Row
 
-FORMAT = "2"
+FORMAT, SUFFIX = "2", ".safetensors"
 #: The kinds of the texts in the header.
 KINDS = {
     "config": typed_json.Config,
@@ -43,11 +43,6 @@ KINDS = {
 }
 #: The digest in a header. Texts in the header have their quotes escaped.
 _SEAL = re.compile(rb'"sha256":"([0-9a-f]{64})"')
-
-
-def is_agent_file(path: Path) -> bool:
-    """Returns True if a path has the suffix of agent files."""
-    return path.suffix == ".safetensors"
 
 
 def write(

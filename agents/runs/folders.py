@@ -157,7 +157,7 @@ def find(name: str, member: int | str | None = "best") -> Path:
 
         return path if member is None else populations.member(path, member)
     is_run = any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints"))
-    if is_run or (agent_file.is_agent_file(path) and os.path.isfile(path)):
+    if is_run or (path.suffix == agent_file.SUFFIX and os.path.isfile(path)):
         return path
     problem, agents = "is neither a run folder nor a pretrained agent", pretrained()
     if os.path.exists(path):
@@ -182,7 +182,7 @@ def load_checkpoint(
 ) -> checkpoint.Checkpoint:
     """Loads the latest intact checkpoint, or agent file, of a path from `find`, if trusted."""
     with user_errors(kinds=(OSError, checkpoint.CheckpointError)):
-        if agent_file.is_agent_file(path):
+        if path.suffix == agent_file.SUFFIX:
             loaded = agent_file.read(path, device)
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
@@ -222,7 +222,7 @@ def checkpoints_of(path: Path) -> Path:
 
 def folder_of(path: Path) -> Path:
     """Returns the run folder of a path from `find`; for an agent file one for its results."""
-    if agent_file.is_agent_file(path):
+    if path.suffix == agent_file.SUFFIX:
         return RUNS / f"pretrained-{path.stem}"
     if is_population(path):
         return path
@@ -231,7 +231,7 @@ def folder_of(path: Path) -> Path:
 
 def name_of(path: Path) -> str:
     """Returns the agent's name in tables: that of its run folder or agent file."""
-    if agent_file.is_agent_file(path):
+    if path.suffix == agent_file.SUFFIX:
         return path.stem
     folder = folder_of(path)
     is_member = is_population(folder.parent)

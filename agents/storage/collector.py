@@ -11,7 +11,7 @@ import torch
 from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import Actor
-from megastep.arrdict import arrdict
+from megastep.arrdict import arrdict, clone
 from megastep.capture import HostState, capture
 from megastep.dotdict import leaves
 from megastep.types import Env, Tree, optional
@@ -29,8 +29,8 @@ def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
     """
     first = rollout.select_lanes(env.reset())
     rollout.allocate_optional(first)
-    world = _stored(first).map(torch.clone)
-    return arrdict(world=world, state=policy.initial(len(world.reset), world.reset.device))
+    state = policy.initial(len(first.reset), first.reset.device)
+    return arrdict(world=clone(_stored(first)), state=state)
 
 
 @torch.no_grad()

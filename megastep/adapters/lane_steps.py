@@ -16,8 +16,6 @@ from megastep.dotdict import leaves, mapping
 from megastep.engine.resets import copies
 from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 
-__all__ = ["Copies", "Lanes", "ended", "fresh"]
-
 WORD = 4  # bytes
 BLOCK_BYTES, BLOCK_ROWS = 2**27, 32  # at most, of copies that share memory
 

@@ -12,8 +12,6 @@ from megastep import arrdict
 from megastep.adapters.vector_env import VectorEnv, row
 from megastep.types import Env, Tree, optional
 
-__all__ = ["ParallelEnv"]
-
 
 class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeIssues]
     """An environment of megastep with N = 1 as a `pettingzoo.ParallelEnv`, in NumPy.

@@ -11,8 +11,6 @@ from megastep.arrdict import arrdict
 from megastep.envs.first_person import FirstPerson
 from megastep.types import Env, Tree, World, optional
 
-__all__ = ["RslRlVecEnv"]
-
 
 class _LimitedLanes(Lanes):
     """Steps lanes, and truncates episodes at a length; ``lengths`` (B,) int64 may be written."""

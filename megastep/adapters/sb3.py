@@ -12,8 +12,6 @@ from torch import nn
 from megastep.adapters.vector_env import VectorEnv
 from megastep.types import Env, Tree, optional
 
-__all__ = ["SB3VecEnv"]
-
 #: What sb3-contrib's learners with masks call, in lanes that have it.
 ACTION_MASKS = "action_masks"
 

@@ -14,8 +14,6 @@ from megastep.adapters.lane_steps import Lanes, ended, fresh
 from megastep.adapters.vector_env import as_dtype, without_agents
 from megastep.types import Env, optional
 
-__all__ = ["TorchRLEnv"]
-
 
 class TorchRLEnv(EnvBase):
     """An environment of megastep, whose resets take masks, as a `torchrl.envs.EnvBase`,

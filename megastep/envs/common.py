@@ -8,8 +8,10 @@ import torch
 from megastep import engine
 from megastep.arrdict import arrdict, numpyify
 from megastep.core import Core
+from megastep.devices import threads
+from megastep.engine import checks
 from megastep.engine.agents import check_on_cpu
-from megastep.engine.launch_params import world_params
+from megastep.engine.launch_params import seed_params, world_params
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
 from megastep.modules import RandomSpawns
@@ -19,7 +21,7 @@ from megastep.types import Env
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["DisplayedEnv", "SceneryEnv", "Weight", "judged", "step_outputs", "world_of"]
+__all__ = ["BoardEnv", "DisplayedEnv", "SceneryEnv", "Weight", "judged", "step_outputs", "world_of"]
 
 FLAGS = "reset", "terminal", "truncated"
 
@@ -111,6 +113,66 @@ class DisplayedEnv:
     def display(self, e: int = 0) -> "Figure":
         """Draws environment ``e`` as it is now. Returns a matplotlib figure."""
         return self.plot_state(numpyify(self.state(e)))
+
+
+class BoardEnv(DisplayedEnv):
+    """A game on a board, of which one kernel plays a step. A subclass has ``_world(actions)``."""
+
+    n_envs: int
+    n_agents: int
+    device: torch.device
+    seed: int
+    #: Rows of ``games`` that count draws, and say whose episode has ended.
+    draws_row: int
+    ended_row: int
+    _world: Callable[[torch.Tensor], arrdict]
+
+    def _allocate(self, n_fields: int, *lanes_last: str) -> None:
+        """Makes ``games``, (n_fields, N) int32."""
+        on: dict = dict(device=self.device)
+        self.games = torch.zeros((n_fields, self.n_envs), dtype=torch.int32, **on)
+        self.error_flag = torch.zeros(1, dtype=torch.int32, **on)
+        self.no_actions = torch.zeros((self.n_envs * self.n_agents, 1), dtype=torch.int64, **on)
+        self._resets = engine.Resets(("games", *lanes_last), draws={"games": self.draws_row})
+
+    def _begin(self, mask: torch.Tensor) -> arrdict:
+        self.games[self.ended_row].copy_(mask.view(self.n_envs, -1).any(1))
+        return self._world(self.no_actions)
+
+    def step(self, decision: Mapping) -> arrdict:
+        """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
+        actions = checks.alike("actions", decision["actions"], self.no_actions)
+        return self._resets.keep(self._world(actions))
+
+    def _play(
+        self,
+        library: KernelLibrary,
+        operation: str,
+        actions: torch.Tensor,
+        outputs: Mapping,
+        **fields: Any,
+    ) -> None:
+        """Launches the kernel of a step, which writes :func:`step_outputs`."""
+        launch(
+            *(library, operation, self.device, self.n_envs),
+            games=self.games,
+            actions=actions.contiguous(),
+            **outputs,
+            error_flag=self.error_flag,
+            **seed_params(self.seed),
+            n_envs=self.n_envs,
+            n_threads=threads(),
+            **fields,
+        )
+        if self.device.type == "cpu":
+            self.check()
+
+    def check(self) -> None:
+        """Raises EngineError if the engine flagged an error on the device since the last check.
+
+        Synchronises host and device, so do not call it from ``step``.
+        """
+        engine.check_flag(self.error_flag)
 
 
 class SceneryEnv(DisplayedEnv):

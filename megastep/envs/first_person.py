@@ -20,8 +20,6 @@ from megastep.types import Geometries
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FirstPerson", "images"]
-
 
 def images(view: engine.Observation) -> arrdict:
     """Returns ``rgb`` (B, 1, 3, C, P), ``d`` (B, 1, 1, C, P), ``imu`` (B, 1, 3); C cameras."""

@@ -23,8 +23,6 @@ from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import BLOCK, launch
 from megastep.modules.spawning import CLEARANCE, candidates
 
-__all__ = ["Geodesics", "PathGraph", "draw_points", "geodesics", "largest_part", "n_cells"]
-
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 CELL = 0.1  # metres, of fields
 SIDES = 16  # of the polygon around the end of a wall

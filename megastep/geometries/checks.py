@@ -9,8 +9,6 @@ import numpy as np
 from megastep import geometry
 from megastep.dotdict import dotdict
 
-__all__ = ["clearance", "errors", "fine_rooms", "joins"]
-
 FINE = 0.05  # metres per cell of the raster
 MAX_FINE_CELLS = 2_250_000  # of the raster; a plan of 75 m x 75 m
 RADIUS = 0.15 / 2**0.5  # metres; of an agent

@@ -17,8 +17,6 @@ from megastep.arrdict import arrdict
 from megastep.dotdict import dotdict
 from megastep.types import Space
 
-__all__ = ["actions", "identifiers", "observation"]
-
 #: The fewest rows and columns of an image, those of one of floats without an axis for channels, and
 #: the channels up to which any array with so many rows and columns is an image.
 MIN_SIDE, MIN_FLOAT_SIDE, FEW_CHANNELS = 8, 16, 4

@@ -3,8 +3,6 @@
 import traceback
 from pathlib import Path
 
-__all__ = ["BadValue", "EnvError", "one_line"]
-
 _HERE = str(Path(__file__).parent)
 
 

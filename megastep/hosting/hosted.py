@@ -28,8 +28,6 @@ from megastep.hosting.probe import (
 )
 from megastep.types import Space, Tree
 
-__all__ = ["HostedEnvs", "ParallelEnvs", "make_env"]
-
 
 def make_env(spec: Any, wrappers: Sequence[Callable], settings: dict) -> gymnasium.Env:
     """Returns an environment of Gymnasium by its specification, inside wrappers."""

@@ -18,8 +18,6 @@ from megastep.hosting.hosted import HostedEnvs
 from megastep.hosting.probe import Probe, probe
 from megastep.types import Tree
 
-__all__ = ["VectorProcesses"]
-
 #: Seconds in which a worker that is to end may finish what it does.
 PATIENCE = 5
 

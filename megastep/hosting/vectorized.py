@@ -21,8 +21,6 @@ from megastep.hosting.conversions import actions, identifiers, observation
 from megastep.hosting.env_error import BadValue, EnvError, one_line
 from megastep.types import Tree
 
-__all__ = ["VectorizedEnv", "one_sentence"]
-
 #: The most numbers of an ``info`` that become metrics.
 MAX_NUMBERS = 16
 #: Steps of an episode in an evaluation, of environments whose specification names no limit.

@@ -151,7 +151,8 @@ class RandomSpawns:
                 cached_points(geometries[: self._n_layouts], *size, self.seed)
             )
         self.points = torch.as_tensor(points, device=core.device)
-        self.counts, self.point_index = core.agent_full(0).int(), core.agent_full(0).int()
+        zeros = torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
+        self.counts, self.point_index = zeros, zeros.clone()
         #: (D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``. None:
         #: every layout is as likely.
         self.cumulative: torch.Tensor | None = None

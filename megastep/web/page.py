@@ -18,8 +18,6 @@ from megastep.plotting.styles import AGENTS, THEMES
 from megastep.types import Env, n_lanes, optional
 from megastep.web.program import Buffer, Launch, Leaf, Program, Ref, words
 
-__all__ = ["SHIPPED", "module", "page", "scene"]
-
 FOLDER = Path(__file__).parent
 #: The module that comes with megastep; `make wasm` builds it.
 SHIPPED = FOLDER / "megastep.wasm"

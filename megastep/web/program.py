@@ -12,8 +12,6 @@ import torch
 from megastep.kernels.build.compile import cpu
 from megastep.kernels.build.kernel_library import KernelLibrary
 
-__all__ = ["Buffer", "Launch", "Leaf", "Program", "Ref", "Replay"]
-
 
 class Word(NamedTuple):
     """A pointer or number of a struct."""

@@ -21,8 +21,6 @@ from megastep.spaces import random_actions
 from megastep.types import Env, World, n_lanes, optional
 from megastep.web.program import Buffer, Launch, Leaf, Program, Ref, Replay, words
 
-__all__ = ["record"]
-
 #: Steps with random actions that a replay must repeat, beside the recorded ones.
 N_CHECKED = 16
 #: Operators that only reserve memory.

@@ -19,9 +19,6 @@ from megastep.types import Env, Space, Tree, n_lanes
 from megastep.wrappers.actions import Probability, normal
 from megastep.wrappers.base import Draws, Levels, Wrapper, along
 
-__all__ = ["ClipReward", "DropSensor", "FrameStack", "NoisySensor", "OdometryDrift"]
-__all__ += ["ScaleReward", "ShapeReward"]
-
 NUMBERS = spaces.MultiImage, spaces.MultiVector
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Reward = Annotated[float, Field(ge=-(10**6), le=10**6)]

@@ -2,7 +2,6 @@
 
 import difflib
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -12,12 +11,8 @@ from pydantic import Field
 
 from megastep import engine, plotting, spaces
 from megastep.arrdict import arrdict
-from megastep.devices import threads
-from megastep.engine import checks
-from megastep.engine.launch_params import seed_params
-from megastep.envs.common import DisplayedEnv, step_outputs, world_of
+from megastep.envs.common import BoardEnv, step_outputs, world_of
 from megastep.kernels.build.kernel_library import KernelLibrary
-from megastep.kernels.build.launch import launch
 from megastep.settings import MAX_ENVS, checked
 
 if TYPE_CHECKING:
@@ -27,7 +22,7 @@ __all__ = ["MinAtar"]
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 _C = LIBRARY.constants
-SIDE, AGE, ENDED, LAST_ACTION = (_C[name] for name in ("SIDE", "AGE", "ENDED", "LAST_ACTION"))
+SIDE, AGE, LAST_ACTION = (_C[name] for name in ("SIDE", "AGE", "LAST_ACTION"))
 #: The actions of each game that do something, by their numbers in the original.
 ACTIONS = {
     "asterix": (0, 1, 2, 3, 4),
@@ -50,7 +45,7 @@ class Variant(NamedTuple):
         return _C["_".join(filter(None, (self.game.upper(), name)))]
 
 
-class MinAtar(DisplayedEnv):
+class MinAtar(BoardEnv):
     """The games of MinAtar (Young and Tian 2019), with the rules of minatar 1.0.15.
 
     Observation:
@@ -82,6 +77,7 @@ class MinAtar(DisplayedEnv):
 
     fps = 10.0
     n_agents = 1
+    draws_row, ended_row = _C["N_DRAWS"], _C["ENDED"]
 
     @checked
     def __init__(
@@ -111,54 +107,29 @@ class MinAtar(DisplayedEnv):
         )
         engine.fit(n_envs, 64 + 4 * (n_fields + n_lists) + n_channels * SIDE**2, self.device)
         on: dict = dict(device=self.device)
-        self.games = torch.zeros((n_fields, n_envs), dtype=torch.int32, **on)
         self.lists = torch.zeros((n_lists, n_envs), dtype=torch.int32, **on) if n_lists else None
         self.images = torch.zeros((n_envs, *self.obs_space.shape), dtype=torch.uint8, **on)
-        self.error_flag = torch.zeros(1, dtype=torch.int32, **on)
-        self.no_actions = torch.zeros((n_envs, 1), dtype=torch.int64, **on)
-        self._resets = engine.Resets(lanes_last=("games", "lists"), draws={"games": _C["N_DRAWS"]})
+        self._allocate(n_fields, "lists")
 
     def _begin(self, mask) -> arrdict:
-        self.games[ENDED].copy_(mask)
         self.games[LAST_ACTION].masked_fill_(mask, 0)  # so that a seed determines the episode
-        return self._world(self.no_actions)
-
-    def step(self, decision: Mapping) -> arrdict:
-        """Takes one step with ``decision.actions`` (N, 1). Returns a world."""
-        actions = checks.alike("actions", decision["actions"], self.no_actions)
-        return self._resets.keep(self._world(actions))
+        return super()._begin(mask)
 
     def _world(self, actions) -> arrdict:
         outputs, numbers = step_outputs(self, 0, {}, {}), self.variant.actions
-        launch(
-            *(LIBRARY, "minatar_step", self.device, self.n_envs),
-            games=self.games,
+        self._play(
+            *(LIBRARY, "minatar_step", actions, outputs),
             lists=self.lists,
-            actions=actions.contiguous(),
-            **outputs,
             image=self.images,
-            error_flag=self.error_flag,
-            **seed_params(self.seed),
             sticky=self.sticky,
-            n_envs=self.n_envs,
             n_channels=self.images.shape[2],
             game=self.variant.constant(""),
             limit=self.limit,
             is_ramping=self.ramping,
             n_actions=len(numbers),
             action_set=sum(number << 4 * i for i, number in enumerate(numbers)),
-            n_threads=threads(),
         )
-        if self.device.type == "cpu":
-            engine.check_flag(self.error_flag)
         return world_of(outputs, self.images, [])
-
-    def check(self) -> None:
-        """Raises EngineError if the engine flagged an error on the device since the last check.
-
-        Synchronises host and device, so do not call it from ``step``.
-        """
-        engine.check_flag(self.error_flag)
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`: ``image`` (C, 10, 10) uint8, 0 or 1;

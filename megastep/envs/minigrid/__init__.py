@@ -1,7 +1,7 @@
 """MiniGrid's tasks, equal to minigrid 3.2 step for step. N environments, a lane each."""
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 import torch
@@ -9,14 +9,10 @@ from pydantic import Field
 
 from megastep import engine, plotting, spaces
 from megastep.arrdict import arrdict
-from megastep.devices import threads
-from megastep.engine import checks
-from megastep.engine.launch_params import seed_params
-from megastep.envs.common import DisplayedEnv, step_outputs, world_of
+from megastep.envs.common import BoardEnv, step_outputs, world_of
 from megastep.envs.minigrid.drawing import draw
 from megastep.envs.minigrid.tasks import LIBRARY, TASKS, Task
 from megastep.imports import import_object
-from megastep.kernels.build.launch import launch
 from megastep.settings import MAX_ENVS, checked
 
 if TYPE_CHECKING:
@@ -28,10 +24,9 @@ VIEW, N_MISSION = LIBRARY.constants["VIEW"], LIBRARY.constants["N_MISSION"]
 GAME_FIELDS = LIBRARY.constants["GAME_FIELDS"]
 Rooms = Annotated[int, Field(ge=1, le=LIBRARY.constants["MAX_ROOMS"])]
 MAX_SIZE = 128  # cells along a side of a custom grid
-N_DRAWS, ENDED = 5, 6  # rows of a game's state
 
 
-class MiniGrid(DisplayedEnv):
+class MiniGrid(BoardEnv):
     """The grid worlds of MiniGrid (Chevalier-Boisvert et al. 2023), with the layouts, dynamics,
     rewards and limits of minigrid 3.2, or grids of one's own.
 
@@ -69,6 +64,7 @@ class MiniGrid(DisplayedEnv):
     fps = 10.0
     controls = {"ArrowLeft": 0, "ArrowRight": 1, "ArrowUp": 2, "p": 3, "d": 4, " ": 5, "Enter": 6}
     n_agents = 1
+    draws_row, ended_row = 5, 6
 
     @checked
     def __init__(
@@ -103,21 +99,8 @@ class MiniGrid(DisplayedEnv):
             )
         shape = n_envs, self.task.height, self.task.width
         engine.fit(n_envs, 512 + shape[1] * shape[2], self.device)
-        on: dict = dict(device=self.device)
-        self.cells = torch.zeros(shape, dtype=torch.uint8, **on)
-        self.games = torch.zeros((GAME_FIELDS, n_envs), dtype=torch.int32, **on)
-        self.error_flag = torch.zeros(1, dtype=torch.int32, **on)
-        self.no_actions = torch.zeros((n_envs, 1), dtype=torch.int64, **on)
-        self._resets = engine.Resets(lanes_last=("games",), draws={"games": N_DRAWS})
-
-    def _begin(self, mask) -> arrdict:
-        self.games[ENDED].copy_(mask)
-        return self._world(self.no_actions)
-
-    def step(self, decision: Mapping) -> arrdict:
-        """Takes one step with ``decision.actions`` (N, 1). Returns a world."""
-        actions = checks.alike("actions", decision["actions"], self.no_actions)
-        return self._resets.keep(self._world(actions))
+        self.cells = torch.zeros(shape, dtype=torch.uint8, device=self.device)
+        self._allocate(GAME_FIELDS)
 
     def _world(self, actions) -> arrdict:
         n, task = self.n_envs, self.task
@@ -126,32 +109,16 @@ class MiniGrid(DisplayedEnv):
         obs = arrdict(image=image, direction=torch.empty_like(actions))
         if task.has_mission:
             obs["mission"] = outputs["mission"]
-        launch(
-            *(LIBRARY, "minigrid_step", self.device, n),
+        self._play(
+            *(LIBRARY, "minigrid_step", actions, outputs),
             cells=self.cells,
-            games=self.games,
-            actions=actions.contiguous(),
-            **outputs,
             image=image,
             direction=obs["direction"],
             layouts=self.layouts,
             starts=self.starts,
-            error_flag=self.error_flag,
-            **seed_params(self.seed),
-            n_envs=n,
             **task._asdict(),
-            n_threads=threads(),
         )
-        if self.device.type == "cpu":
-            engine.check_flag(self.error_flag)
         return world_of(outputs, obs, ["success"])
-
-    def check(self) -> None:
-        """Raises EngineError if the engine flagged an error on the device since the last check.
-
-        Synchronises host and device, so do not call it from ``step``.
-        """
-        engine.check_flag(self.error_flag)
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`.

@@ -9,8 +9,6 @@ from megastep.envs.minigrid.tasks import LIBRARY
 if TYPE_CHECKING:
     from megastep.plotting.pictures import Area
 
-__all__ = ["draw"]
-
 COLOURS = "#e5484d", "#30a46c", "#3e63dd", "#8e4ec6", "#f5d90a", "#8b8d98"
 LAVA = "#ff8000"
 KINDS = {LIBRARY.constants[name]: name for name in ("WALL", "OPEN_DOOR", "KEY", "BALL", "BOX")}

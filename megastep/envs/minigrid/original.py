@@ -9,8 +9,6 @@ from gymnasium import spaces
 
 from megastep.envs.minigrid.tasks import LIBRARY, TASKS
 
-__all__ = ["AsHere", "as_here", "mission_of"]
-
 VIEW, N_MISSION = LIBRARY.constants["VIEW"], LIBRARY.constants["N_MISSION"]
 COLOURS = "red", "green", "blue", "purple", "yellow", "grey"
 KINDS = "key", "ball", "box"

@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 from megastep.kernels.build.kernel_library import KernelLibrary
 
-__all__ = ["LIBRARY", "TASKS", "Task"]
-
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 _C = LIBRARY.constants
 RED, GREY = 0, 5

@@ -3,7 +3,6 @@
 N environments. B lanes: N, the left paddles, or 2 N with self-play. There is no geometry.
 """
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -12,12 +11,8 @@ from pydantic import Field
 
 from megastep import engine, plotting, spaces
 from megastep.arrdict import arrdict
-from megastep.devices import threads
-from megastep.engine import checks
-from megastep.engine.launch_params import seed_params
-from megastep.envs.common import DisplayedEnv, step_outputs, world_of
+from megastep.envs.common import BoardEnv, step_outputs, world_of
 from megastep.envs.pong.tracker import LIBRARY, Tracker
-from megastep.kernels.build.launch import launch
 from megastep.settings import MAX_ENVS, checked
 
 if TYPE_CHECKING:
@@ -31,10 +26,9 @@ GAME_FIELDS = LIBRARY.constants["GAME_FIELDS"]  # of a game's state
 ROWS, COLUMNS = LIBRARY.constants["ROWS"], LIBRARY.constants["COLUMNS"]
 PADDLE_ROWS = LIBRARY.constants["PADDLE_ROWS"]
 LIMITS = 1, 1, 1, 1, 1, 1, 2, 2  # of the features' magnitudes
-N_DRAWS, ENDED = 11, 12  # rows of a game's state
 
 
-class Pong(DisplayedEnv):
+class Pong(BoardEnv):
     """Two-player Pong against a scripted tracker or in self-play.
 
     The ball moves one cell per step across the court and up to one cell up or down, more steeply
@@ -76,6 +70,7 @@ class Pong(DisplayedEnv):
     """
 
     fps, bot = 30.0, Tracker
+    draws_row, ended_row = 11, 12
     controls = {"ArrowUp": 1, "ArrowDown": 2}
 
     @checked
@@ -100,57 +95,27 @@ class Pong(DisplayedEnv):
         self.obs_space = spaces.MultiVector(
             1, FEATURES, low=tuple(-limit for limit in LIMITS), high=LIMITS
         )
-        n_lanes = n_envs * self.n_agents
         engine.fit(n_envs, 64 + self.n_agents * (64 + pixels * ROWS * COLUMNS), self.device)
-        on: dict = dict(device=self.device)
-        self.games = torch.zeros((GAME_FIELDS, n_envs), dtype=torch.int32, **on)
-        self.error_flag = torch.zeros(1, dtype=torch.int32, **on)
-        self.no_actions = torch.zeros((n_lanes, 1), dtype=torch.int64, **on)
-        self._resets = engine.Resets(lanes_last=("games",), draws={"games": N_DRAWS})
+        self._allocate(GAME_FIELDS)
         self.pixels = None
         if pixels:
             self.obs_space = spaces.MultiImage(1, 1, ROWS, COLUMNS, dtype=torch.uint8)
-            shape = n_lanes, *self.obs_space.shape
-            self.pixels = torch.zeros(shape, dtype=torch.uint8, **on)
-
-    def _begin(self, mask) -> arrdict:
-        self.games[ENDED].copy_(mask.view(self.n_envs, -1).any(1))
-        return self._world(self.no_actions)
-
-    def step(self, decision: Mapping) -> arrdict:
-        """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
-        actions = checks.alike("actions", decision["actions"], self.no_actions)
-        return self._resets.keep(self._world(actions))
+            shape = n_envs * self.n_agents, *self.obs_space.shape
+            self.pixels = torch.zeros(shape, dtype=torch.uint8, device=self.device)
 
     def _world(self, actions) -> arrdict:
         sizes = dict(features=0 if self.pixels is not None else FEATURES), {}
         outputs = step_outputs(self, 1, *sizes)
-        launch(
-            *(LIBRARY, "pong_step", self.device, self.n_envs),
-            games=self.games,
-            actions=actions.contiguous(),
-            **outputs,
+        self._play(
+            *(LIBRARY, "pong_step", actions, outputs),
             pixels=self.pixels,
-            error_flag=self.error_flag,
-            **seed_params(self.seed),
-            n_envs=self.n_envs,
             n_sides=self.n_agents,
             points=self.points,
             limit=self.limit,
             tracker_speed=round(CELL * self.tracker_speed),
-            n_threads=threads(),
         )
-        if self.device.type == "cpu":
-            engine.check_flag(self.error_flag)
         obs = outputs["features"] if self.pixels is None else self.pixels
         return world_of(outputs, obs, ["points_won"])
-
-    def check(self) -> None:
-        """Raises EngineError if the engine flagged an error on the device since the last check.
-
-        Synchronises host and device, so do not call it from ``step``.
-        """
-        engine.check_flag(self.error_flag)
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`.
