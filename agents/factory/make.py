@@ -16,8 +16,7 @@ from megastep.agents.factory import check, components, settings
 from megastep.agents.factory.components import env_name, label
 from megastep.agents.factory.settings import Agent, Env, Geometry, Learner, Played, Train, Trained
 from megastep.agents.generator import stream_seed
-from megastep.agents.networks.linear import share_threads
-from megastep.agents.networks.policy import Policy
+from megastep.agents.networks.policy import Policy, share_threads
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.runs.saver import check_plain, nbytes
 from megastep.agents.selfplay.bots import BOTS

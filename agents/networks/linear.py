@@ -24,7 +24,7 @@ from megastep.agents.networks.fused import (
     is_built_for_cpu,
     is_plain_on_gpu,
 )
-from megastep.devices import set_threads, threads
+from megastep.devices import threads
 from megastep.kernels.build.launch import WARP, Blocks, launch
 
 if TYPE_CHECKING:
@@ -339,13 +339,6 @@ def matmul(
         **dict(adds=adds, has_relu=has_relu, n_threads=threads()),
     )
     return out
-
-
-def share_threads(width: int) -> None:
-    """Gives kernels all threads of the CPU, and PyTorch one per 128 units of a layer."""
-    n_threads = threads()
-    set_threads(n_threads)
-    torch.set_num_threads(max(1, min(n_threads, width // 128)))
 
 
 # ---- Linear recurrences ----

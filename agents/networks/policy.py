@@ -16,6 +16,7 @@ from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, heads, intakes, running_norm
 from megastep.agents.networks.linear import ComputeDtype
 from megastep.arrdict import arrdict
+from megastep.devices import set_threads, threads
 from megastep.dotdict import leaves, mapping
 from megastep.imports import import_path, known_name
 from megastep.settings import checked
@@ -311,3 +312,10 @@ class Policy(nn.Module):
             norm.clear()
         if self.critic is not None:
             self.critic.output.clear()
+
+
+def share_threads(width: int) -> None:
+    """Gives kernels all threads of the CPU, and PyTorch one per 128 units of a layer."""
+    n_threads = threads()
+    set_threads(n_threads)
+    torch.set_num_threads(max(1, min(n_threads, width // 128)))

@@ -6,8 +6,7 @@ import torch
 
 from megastep import spaces
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.networks.linear import share_threads
-from megastep.agents.networks.policy import TRAINING_ONLY, Policy
+from megastep.agents.networks.policy import TRAINING_ONLY, Policy, share_threads
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:

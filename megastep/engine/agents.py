@@ -119,9 +119,3 @@ def check_flag(error_flag: torch.Tensor, objects: Objects | None = None) -> None
         raise EngineError(f"The error flag holds {flag}, which no kernel writes.")
     env, k = divmod(index, objects.n_objects)
     raise EngineError(f"In environment {env}, {objects.names[k]} {_OF_OBJECTS[kind]}.")
-
-
-def check_on_cpu(agents: Agents) -> None:
-    """Does what :func:`check` does if the agents are on the CPU, where nothing synchronises."""
-    if agents.error_flag.is_cpu and agents.error_flag.item():
-        check(agents)

@@ -1,4 +1,6 @@
-"""The fields that many launches share: tensors' addresses, checked without synchronisation."""
+"""Launches in a scenery, and the fields that they share: tensors' addresses, checked without
+synchronisation.
+"""
 
 import ctypes
 from typing import Any
@@ -7,13 +9,15 @@ import torch
 
 from megastep import devices
 from megastep.engine import checks
-from megastep.engine.agents import Agents
+from megastep.engine.agents import Agents, check
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.launch import ENGINE
+from megastep.kernels.build.kernel_library import KernelLibrary
+from megastep.kernels.build.launch import ENGINE, Blocks, launch
 
 _address = torch.Tensor.data_ptr
 #: Axes of the agents' tensors behind (N, A).
 _STATE = dict(positions=(2,), angles=(), velocity=(2,), angvelocity=())
+POSE, MOTION = ("positions", "angles"), (*_STATE,)
 
 
 class _Cached:
@@ -107,11 +111,28 @@ def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int
     return addresses
 
 
-def world_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, bytes | int]:
-    """Returns the fields ``scenery`` and ``error_flag``, and those of :func:`state_params`."""
+def launch_in(
+    scenery: Scenery,
+    agents: Agents,
+    operation: str,
+    shape: int | Blocks,
+    *names: str,
+    library: KernelLibrary = ENGINE,
+    **fields: object,
+) -> None:
+    """Launches an operation with the fields ``scenery`` and ``error_flag``, those of
+    :func:`state_params` and others. Raises what it flags on a CPU, where nothing synchronises.
+    """
     flag = checks.address("agents.error_flag", agents.error_flag, (1,), torch.int32, scenery.device)
-    packed = scenery_params(scenery, agents.radius)
-    return dict(scenery=packed, error_flag=flag, **state_params(scenery, agents, *names))
+    launch(
+        *(library, operation, scenery.device, shape),
+        scenery=scenery_params(scenery, agents.radius),
+        error_flag=flag,
+        **state_params(scenery, agents, *names),
+        **fields,
+    )
+    if scenery.device.type == "cpu" and agents.error_flag.item():
+        check(agents)
 
 
 def lanes_of(scenery: Scenery, agents: Agents) -> tuple[int, int]:

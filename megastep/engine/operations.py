@@ -11,13 +11,15 @@ import torch
 from megastep import cache
 from megastep.devices import n_resident_threads, threads
 from megastep.engine import checks
-from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.agents import Agents
 from megastep.engine.launch_params import (
+    MOTION,
+    POSE,
     lanes_of,
+    launch_in,
     object_params,
     scenery_params,
     seed_params,
-    world_params,
 )
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
@@ -134,9 +136,8 @@ def physics(
         kernel, shape = "physics_bodies", Blocks(-(-n // n_envs), shared=n_bytes)
         names = "force", "grip", "ramp_steps", "grab_elevated"
         of_bodies = {name: getattr(scenery.objects, name) for name in names}
-    launch(
-        *(ENGINE, kernel, device, shape),
-        **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+    launch_in(
+        *(scenery, agents, kernel, shape, *MOTION),
         **of_bodies,
         progress=progress,
         actions=actions_at,
@@ -148,7 +149,6 @@ def physics(
         threads_per_env=threads_per_env,
         objects=object_params(scenery),
     )
-    check_on_cpu(agents)
     return Physics(progress)
 
 
@@ -192,9 +192,8 @@ def spawn(
     int32 = torch.int32, device
     kernel = "spawn_hidden" if checks.flag("hidden", hidden) else "spawn"
     kernel += "" if scenery.objects is None else "_objects"
-    launch(
-        *(ENGINE, kernel, device, scenery.n_envs * (1 if kernel == "spawn" else WARP)),
-        **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+    launch_in(
+        *(scenery, agents, kernel, scenery.n_envs * (1 if kernel == "spawn" else WARP), *MOTION),
         mask=checks.address("mask", mask, lanes, torch.bool, device),
         points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, device),
         counts=checks.address("counts", counts, lanes, *int32),
@@ -205,7 +204,6 @@ def spawn(
         resample=int(checks.flag("resample", resample)),
         objects=object_params(scenery),
     )
-    check_on_cpu(agents)
 
 
 def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tensor) -> torch.Tensor:
@@ -234,12 +232,10 @@ def update_objects(scenery: Scenery, agents: Agents) -> None:
     n, _ = lanes_of(scenery, agents)
     if scenery.objects is None:
         return
-    launch(
-        *(ENGINE, "update_objects", scenery.device, n * scenery.objects.n_objects),
-        **world_params(scenery, agents, "positions", "angles"),
+    launch_in(
+        *(scenery, agents, "update_objects", n * scenery.objects.n_objects, *POSE),
         objects=object_params(scenery),
     )
-    check_on_cpu(agents)
 
 
 def place_objects(
@@ -270,9 +266,8 @@ def place_objects(
     n_points = checks.length("points", points, axis=1)
     checks.integer("the number of points per layout", n_points, 1)
     points_shape = len(scenery.layouts), n_points, 2
-    launch(
-        *(ENGINE, "place_objects", device, scenery.n_envs),
-        **world_params(scenery, agents, "positions", "angles"),
+    launch_in(
+        *(scenery, agents, "place_objects", scenery.n_envs, *POSE),
         objects=object_params(scenery),
         mask=checks.address("mask", mask, shape, torch.bool, device),
         points=checks.address("points", points, points_shape, torch.float32, device),
@@ -281,4 +276,3 @@ def place_objects(
         n_points=n_points,
         apart=checks.number("apart", apart, -1, checks.LIMIT, "metres"),
     )
-    check_on_cpu(agents)

@@ -10,17 +10,12 @@ import torch
 
 from megastep.devices import n_resident_threads
 from megastep.engine import checks
-from megastep.engine.agents import MAX_RES, Agents, check_on_cpu
+from megastep.engine.agents import MAX_RES, Agents
 from megastep.engine.checks import LIMIT
-from megastep.engine.launch_params import (
-    lanes_of,
-    object_params,
-    state_params,
-    world_params,
-)
+from megastep.engine.launch_params import POSE, lanes_of, launch_in, object_params, state_params
 from megastep.engine.operations import update_objects
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
+from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
@@ -65,12 +60,8 @@ _OPTIONAL = dict.fromkeys(
 def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) -> None:
     """Moves the agents' lines to their current poses, and computes the light on them if ``lit``."""
     n, a = lanes_of(scenery, agents)
-    launch(
-        *(ENGINE, "update_agent_geometry", scenery.device, WARP * n * a),
-        **world_params(scenery, agents, "positions", "angles"),
-        lit=int(checks.flag("lit", lit)),
-    )
-    check_on_cpu(agents)
+    lit = checks.flag("lit", lit)
+    launch_in(scenery, agents, "update_agent_geometry", WARP * n * a, *POSE, lit=int(lit))
 
 
 def render(scenery: Scenery, agents: Agents) -> Render:
@@ -185,16 +176,14 @@ def scan(
             "environment: use cameras there"
         )
     ranges = torch.empty((*lanes, n_rays), device=device)
-    launch(
-        *(ENGINE, "scan", device, ranges.numel()),
-        **world_params(scenery, agents, "positions", "angles"),
+    launch_in(
+        *(scenery, agents, "scan", ranges.numel(), *POSE),
         ranges=ranges,
         n_rays=n_rays,
         pitch=360 / n_rays,
         range_min=range_min,
         range_max=range_max,
     )
-    check_on_cpu(agents)
     return ranges
 
 
@@ -214,7 +203,7 @@ def _kernel(scenery, res, subsample) -> str:
 
 
 def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
-    res, device = agents.res, scenery.device
+    res = agents.res
     half_width = math.tan(math.radians(agents.fov / 2))
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)  # of an agent
     n = scenery.n_envs * scenery.n_agents
@@ -226,9 +215,8 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
         n_drawn = len(scenery.objects.line_object) + scenery.objects.n_objects
         shared += LINE_BYTES * n_drawn * n_warps
         kernel = kernel.replace("render", "render_objects")
-    launch(
-        *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared)),
-        **world_params(scenery, agents, "positions", "angles"),
+    launch_in(
+        *(scenery, agents, kernel, Blocks(-(-n // n_per_block), shared=shared), *POSE),
         yaws=agents.yaws,
         ray_lengths=agents.ray_lengths,
         n_cameras=agents.n_cameras,
@@ -246,4 +234,3 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
         objects=object_params(scenery),
         **{**_OPTIONAL, **outputs},
     )
-    check_on_cpu(agents)

@@ -10,8 +10,7 @@ from megastep.arrdict import arrdict, numpyify
 from megastep.core import Core
 from megastep.devices import threads
 from megastep.engine import checks
-from megastep.engine.agents import check_on_cpu
-from megastep.engine.launch_params import seed_params, world_params
+from megastep.engine.launch_params import POSE, launch_in, seed_params
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
 from megastep.modules import RandomSpawns
@@ -63,16 +62,15 @@ def judged(
     if resets.mask is None:
         resets.parts["outputs"] = step_outputs(env, n_metrics, obs, critic)
     outputs = resets.parts["outputs"]
-    launch(
-        *(library, operation, env.device, n_threads or n_lanes),
-        **world_params(core.scenery, core.agents, "positions", "angles"),
+    launch_in(
+        *(core.scenery, core.agents, operation, n_threads or n_lanes, *POSE),
+        library=library,
         ages=env.ages,
         ended=env.ended,
         only_ended=int(resets.mask is not None),
         **outputs,
         **fields,
     )
-    check_on_cpu(core.agents)
     return outputs
 
 

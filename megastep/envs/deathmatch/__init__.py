@@ -213,7 +213,7 @@ class Deathmatch(FirstPerson):
         search = {}
         if self.seen is not None:  # counts newly seen texels
             search = dict(seen=self.seen, clear_mask=self.ended.view(self.n_envs, self.n_agents))
-        view = self._view(**search)
+        view = self._view(centre_line=True, agent_ray=self.has_aim, **search)
         out = self._judge(view, rules)
         obs = arrdict(images(view), health=out["health_obs"])
         if out["sound"] is not None:
@@ -255,9 +255,6 @@ class Deathmatch(FirstPerson):
         )
         return outputs
 
-    def _view(self, core=None, **search) -> engine.Observation:
-        return super()._view(core, centre_line=True, agent_ray=self.has_aim, **search)
-
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`, (A, ...) each.
 
@@ -265,7 +262,8 @@ class Deathmatch(FirstPerson):
         current episode's.
         """
         lanes = slice(e * self.n_agents, (e + 1) * self.n_agents)
-        view, n_model = self._view(self.core.alone(e)), len(self.core.scenery.model)
+        view = self._view(self.core.alone(e), centre_line=True)
+        n_model = len(self.core.scenery.model)
         assert view.centre_line is not None
         line = view.centre_line[0]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
