@@ -246,7 +246,8 @@ def compare(args: argparse.Namespace) -> None:
     trained = factory.config_of(run)
     if not hasattr(trained.env, "n_hiders"):
         raise UserError(f"{runs[0]} was trained in {trained.env.name}, which is not hide and seek")
-    env_settings = settings.changed(trained.env, movable=not args.frozen, resample=False)
+    changes = dict(movable=not args.frozen, resample=False, min_prep=None)
+    env_settings = settings.changed(trained.env, **changes)
     geometry = settings.changed(trained.geometry, n=args.episodes)
     homes = factory.homes(env_settings, geometry, "test")
     n_agents = optional(factory.make_sample(env_settings, homes, device=device), "n_agents")

@@ -131,6 +131,27 @@ def test_seekers_wait_in_the_preparation_and_the_teams_have_opposite_rewards(dev
     assert act(env).reset.all() and env.is_prep.all()
 
 
+def test_nobody_sees_when_a_preparation_of_random_length_ends(device):
+    env = make_env(device, 64, prep=8, min_prep=3, limit=10)
+    env.reset()
+    ends = env.preps.tolist()
+    assert {*ends} == {*range(3, 9)}
+    for step in range(1, 11):
+        world = act(env)
+        is_prep = torch.tensor([step < end for end in ends])
+        assert torch.equal(env.is_prep.cpu(), is_prep)
+        state, reward = (
+            values.cpu().view(64, 4, -1) for values in (world.obs["state"], world.reward)
+        )
+        left = [(8 if step < end else 10) - step for end in ends]
+        of = [8 if step < end else 10 - end for end in ends]
+        expected = torch.tensor(left) / torch.tensor(of)
+        torch.testing.assert_close(state[:, 0, 2], expected.half())
+        assert torch.equal(reward[:, 0, 0] == 0, is_prep)
+    act(env)
+    assert env.preps.tolist() != ends
+
+
 def test_a_seeker_sees_what_is_in_its_view_and_behind_nothing(device):
     env = arranged(device, n_hiders=1, n_seekers=1, n_ramps=0)
     cases = [
@@ -188,7 +209,9 @@ def test_a_shelter_hides(device):
 
 def test_step_matches_twin(device, monkeypatch):
     """Agents are put beside bodies at random, heading anywhere, and use their hands."""
-    env = make_env(device, 16, n_boxes=3, n_seekers=3, limit=14, prep=3, seed=5, resample=True)
+    env = make_env(
+        device, 16, n_boxes=3, n_seekers=3, limit=14, prep=4, min_prep=2, seed=5, resample=True
+    )
     agents, objects, random = env.core.agents, env.objects.all, np.random.default_rng(1)
     env.reset()
     counts = collections.Counter()
@@ -279,6 +302,7 @@ def test_episodes_start_with_room_for_all(variant):
         (dict(geometries=[toys.box(1.2)], variant="homes"), "has no .*room"),
         (dict(geometries=[toys.box(1)], variant="homes", n_long=0, n_ramps=1), "has no .*room"),
         (dict(limit=20, prep=20), "prep=20 leaves nothing of limit=20 steps to play"),
+        (dict(limit=20, prep=9, min_prep=10), "min_prep=10 is above prep=9"),
         (dict(n_boxes=0, n_long=0, n_ramps=0), "at least one"),
         (dict(n_hiders=4), "n_hiders"),
     ],

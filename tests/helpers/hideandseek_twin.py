@@ -15,7 +15,7 @@ from tests.helpers.memory_twin import draws
 
 BODY = "positions", "angles", "sizes", "colours"
 OF_BODIES = "holders", "owners", "locked", "velocity", "angvelocity", "grabbed"
-STATE = "ages", "ended", "placed", "tally", "n_draws", "seen", "blind"
+STATE = "ages", "ended", "placed", "tally", "preps", "n_draws", "seen", "blind"
 
 
 def snapshot(env):
@@ -112,6 +112,8 @@ class Twin:
         start = env.starts[int(env.layout[self.e]), int(numbers[0] * env.starts.shape[1])].cpu()
         m["at"][:], m["positions"][:] = start[: env.n_agents], start[env.n_agents :]
         m["placed"][:], m["tally"][:] = m["positions"], 0
+        low = env.rules["min_prep"]
+        m["preps"].fill_(low + int(numbers[1] * (env.prep - low + 1)))
         for k in range(self.n_bodies):
             self.s["n_draws"][self.e] += 1
             m["angles"][k] = 360 * draws(self.s["n_draws"], seed)[self.e, 0] - 180
@@ -147,10 +149,9 @@ class Twin:
 
     def state(self, a, age):
         env, m = self.env, self.mine
-        k, own, is_prep = self.target(a), int(a >= env.n_hiders), age < env.prep
-        left = (
-            (env.prep - age) / env.prep if is_prep else (env.limit - age) / (env.limit - env.prep)
-        )
+        k, own, is_prep = self.target(a), int(a >= env.n_hiders), age < m["preps"]
+        play = env.limit - int(m["preps"])
+        left = (env.prep - age) / env.prep if is_prep else (env.limit - age) / play
         body = [False] * 5
         if k >= 0:
             holds, owner = int(m["holders"][k]) == a, int(m["owners"][k])
@@ -166,18 +167,18 @@ class Twin:
             self.begin()
         elif actions is not None:
             for a, action in enumerate(actions):
-                if a < n_hiders or before >= env.prep:
+                if a < n_hiders or before >= m["preps"]:
                     done.append(self.act(a, action))
         age = 0 if reset else before + 1
-        is_prep, ends = age < env.prep, not reset and age >= env.limit
+        is_prep, ends = bool(age < m["preps"]), not reset and age >= env.limit
         seen = [False] * env.n_agents if is_prep else self.find_seen()
         is_hidden, phase = not any(seen[:n_hiders]), self.measure()
         if not reset and not is_prep:
             m["tally"][0] += is_hidden
-        if not reset and age == env.prep:
+        if not reset and age == m["preps"]:
             m["tally"][1:] = torch.tensor(phase)
         pairs = [value for both in zip(m["tally"][1:].tolist(), phase) for value in both]
-        n_played = env.limit - env.prep + 1
+        n_played = env.limit - max(int(m["preps"]), 1) + 1
         m["ages"][:], m["ended"][:] = age, ends
         m["seen"][:] = torch.tensor(seen)
         teams = [a >= n_hiders for a in range(env.n_agents)]

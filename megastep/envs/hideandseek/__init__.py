@@ -105,6 +105,9 @@ class HideAndSeek(FirstPerson):
         n_ramps: ramps, 60 x 40 cm. With boxes, at most 16.
         limit: steps of an episode.
         prep: steps of its preparation. Default: a third in the quadrant, two fifths in homes.
+        min_prep: if given, each episode's preparation ends after a random number of steps from this
+            to ``prep``. Agents still see the fraction of ``prep`` that is left, so hiders cannot
+            wait until shortly before seekers come.
         movable: if False, nothing moves the boxes and ramps.
         grab_elevated: agents that have driven up a ramp may grab, and so ride on boxes.
         resample: if True, each episode takes place in a randomly drawn floor plan. Otherwise an
@@ -137,6 +140,7 @@ class HideAndSeek(FirstPerson):
         n_ramps: Count = 1,
         limit: Annotated[int, Field(ge=2, le=10**6)] = 240,
         prep: Annotated[int, Field(ge=0, le=10**6)] | None = None,
+        min_prep: Annotated[int, Field(ge=0, le=10**6)] | None = None,
         movable: bool = True,
         grab_elevated: bool = False,
         seed: int = 1,
@@ -152,6 +156,8 @@ class HideAndSeek(FirstPerson):
             prep = limit // 3 if variant == "quadrant" else 2 * limit // 5
         if prep >= limit:
             raise ValueError(f"prep={prep} leaves nothing of limit={limit} steps to play")
+        if min_prep is not None and min_prep > prep:
+            raise ValueError(f"min_prep={min_prep} is above prep={prep}")
         self.source = self.variant = variant
         self.n_agents, self.n_hiders = n_hiders + n_seekers, n_hiders
         self.limit, self.prep = limit, prep
@@ -180,12 +186,14 @@ class HideAndSeek(FirstPerson):
             n_long=n_long,
             limit=limit,
             prep=prep,
+            min_prep=prep if min_prep is None else min_prep,
             view_cosine=math.cos(math.radians(fov / 2)),
             reach=REACH,
             grab_elevated=int(grab_elevated),
         )
         self.n_draws = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
         self.placed = torch.zeros((n_envs, n_bodies, 2), device=self.device)
+        self.preps = torch.full((n_envs,), prep, dtype=torch.int32, device=self.device)
         self.tally = torch.zeros((n_envs, constants["TALLY"]), device=self.device)
         self.seen = torch.zeros((n_envs, self.n_agents), dtype=torch.bool, device=self.device)
         self.blind = torch.zeros_like(self.seen)
@@ -221,7 +229,7 @@ class HideAndSeek(FirstPerson):
     @property
     def is_prep(self) -> torch.Tensor:
         """(N,) bool, whether hiders still prepare themselves."""
-        return self.steps < self.prep
+        return self.steps < self.preps
 
     def _begin(self, mask) -> arrdict:
         whole = mask.view(self.n_envs, -1).any(1, keepdim=True)  # all agents begin together
@@ -248,7 +256,7 @@ class HideAndSeek(FirstPerson):
             n_lanes=n_lanes,
             n_agents=self.n_agents,
             n_hiders=self.n_hiders,
-            prep=self.prep,
+            preps=self.preps,
         )
         self.movement(dict(actions=moves))
         return self._resets.keep(self._world(actions=actions))
@@ -284,6 +292,7 @@ class HideAndSeek(FirstPerson):
             n_starts=N_STARTS,
             placed=self.placed,
             tally=self.tally,
+            preps=self.preps,
             n_draws=self.n_draws,
             seen=self.seen,
             blind=self.blind,
@@ -298,7 +307,7 @@ class HideAndSeek(FirstPerson):
             self._seen_by(e).map(lambda leaf: leaf * is_open.view(-1, *[1] * (leaf.ndim - 1))),
             core=arrdict(self.core.state(e), teams=(~self.is_hider).long()),
             age=self.steps[e].clone(),
-            left=(self.prep - self.steps[e]).clamp(min=0),
+            left=(self.preps[e] - self.steps[e]).clamp(min=0),
             seen=self.seen[e].clone(),
             is_hider=self.is_hider,
         )

@@ -26,6 +26,7 @@ struct HideAndSeekStepParams : DrawnGameParams {
     const float* starts;       // (D, M, A + K, 2) metres, of agents and bodies
     float* placed;             // (N, K, 2) in and out, as the next: where bodies were at the start
     float* tally;              // (N, TALLY) of the episode so far
+    int* preps;                // (N) in and out: steps of the preparation of the episode
     unsigned char* seen;       // (N, A) out: hiders that are seen, seekers that see one
     unsigned char* blind;      // (N, A) out: seekers that wait
     unsigned short* state;     // (N, A, STATE) out: fp16
@@ -35,7 +36,8 @@ struct HideAndSeekStepParams : DrawnGameParams {
     int n_boxes;               // of the K bodies, as the next
     int n_long;                // elongated boxes
     int limit;                 // steps per episode
-    int prep;                  // steps of the preparation
+    int prep;                  // steps of a preparation at most, and as agents see it
+    int min_prep;              // at least
     float view_cosine;         // of half the field of view
     float reach;               // metres from an agent's centre to a body that it grabs or locks
     int grab_elevated;         // 1: elevated agents may grab
@@ -50,6 +52,7 @@ HD void start_episode(const HideAndSeekStepParams& p, int env, int layout) {
     Philox bits = next_draw(p.n_draws, env, p.key0, p.key1);
     long long row = (long long)layout * p.n_starts + below(bits.a, p.n_starts);
     const float* starts = p.starts + 2 * row * (n_agents + n_bodies);
+    p.preps[env] = p.min_prep + below(bits.b, p.prep - p.min_prep + 1);
     for (int i = 0; i < 2 * n_agents; i++)
         p.positions[2 * env * n_agents + i] = starts[i];
     for (int k = 0; k < n_bodies; k++) {
@@ -185,12 +188,13 @@ HD void measure_all(const HideAndSeekStepParams& p, int env, float* out) {
     measure(p, env, n_boxes, p.objects.n_bodies, out + 2);
 }
 
-// What agent a knows: its team, the preparation, the fraction of the phase that is left; whether it
-// is elevated, holds a body; of the body that it would grab or lock, whether there is one, it is
-// locked by its own team or the other one, or another agent holds it.
+// What agent a knows: its team, the preparation, the fraction of the phase that is left, if the
+// preparation is as long as it can be; whether it is elevated, holds a body; of the body that it
+// would grab or lock, whether there is one, it is locked by its own team or the other one, or
+// another agent holds it.
 HD void write_state(const HideAndSeekStepParams& p, const Walls& walls, int env, int a, int age) {
-    int target = target_of(p, walls, env, a), team = a >= p.n_hiders, is_prep = age < p.prep;
-    int left = (is_prep ? p.prep : p.limit) - age, of = is_prep ? p.prep : p.limit - p.prep;
+    int target = target_of(p, walls, env, a), team = a >= p.n_hiders, is_prep = age < p.preps[env];
+    int left = (is_prep ? p.prep : p.limit) - age, of = is_prep ? p.prep : p.limit - p.preps[env];
     Body body = {};
     if (target >= 0)
         body = bodies_of(p.objects, env)[target];
@@ -247,10 +251,10 @@ HD void write_privileged(const HideAndSeekStepParams& p, int env, int a, unsigne
 }
 
 // Writes the metrics of an episode that ends, else 0.
-HD void write_metrics(const HideAndSeekStepParams& p, int i, const float* tally, const float* phase,
-                      int ends) {
+HD void write_metrics(const HideAndSeekStepParams& p, int i, int prep, const float* tally,
+                      const float* phase, int ends) {
     long long n = (long long)p.scenery.n_envs * p.scenery.n_agents;
-    int n_played = p.limit - maxi(p.prep, 1) + 1;
+    int n_played = p.limit - maxi(prep, 1) + 1;
     p.metrics[i] = ends ? tally[0] / (float)n_played : 0.f;
     for (int k = 0; k < PHASE; k++) {
         p.metrics[(1 + 2 * k) * n + i] = ends ? tally[1 + k] : 0.f;
@@ -270,11 +274,12 @@ HD void hideandseek_env(const HideAndSeekStepParams& p, const Group& group, int 
         for (int a = 0; a < n_agents; a++) {
             long long action = p.actions[first + a];
             int is_hand = action == GRAB || action == LOCK;
-            if (is_hand && (a < p.n_hiders || old_age >= p.prep))
+            if (is_hand && (a < p.n_hiders || old_age >= p.preps[env]))
                 use_hand(p, walls, env, a, action == LOCK);
         }
     sync(group);
-    int age = reset ? 0 : old_age + 1, is_prep = age < p.prep, ends = !reset && age >= p.limit;
+    int age = reset ? 0 : old_age + 1, prep = p.preps[env], is_prep = age < prep;
+    int ends = !reset && age >= p.limit;
     unsigned int seen = is_prep ? 0u : find_seen(p, group, walls, env);
     int is_seen = (seen & ((1u << p.n_hiders) - 1u)) != 0;
     float tally[TALLY], phase[PHASE] = {};
@@ -282,9 +287,9 @@ HD void hideandseek_env(const HideAndSeekStepParams& p, const Group& group, int 
         tally[i] = p.tally[TALLY * env + i];
     if (!reset && !is_prep)
         tally[0] += (float)!is_seen;
-    if (!reset && (age == p.prep || ends))
+    if (!reset && (age == prep || ends))
         measure_all(p, env, phase);
-    for (int i = 0; i < PHASE && !reset && age == p.prep; i++)
+    for (int i = 0; i < PHASE && !reset && age == prep; i++)
         tally[1 + i] = phase[i];
     sync(group);
     for (int i = group.rank; i < TALLY; i += Group::SIZE)
@@ -294,7 +299,7 @@ HD void hideandseek_env(const HideAndSeekStepParams& p, const Group& group, int 
         flag_nonfinite(p.error_flag, env, p.positions[2 * i], p.positions[2 * i + 1], p.angles[i]);
         float reward = reset || is_prep ? 0.f : team == is_seen ? 1.f : -1.f;
         write_outcome(p, i, reward, reset, age, ends, 1);
-        write_metrics(p, i, tally, phase, ends);
+        write_metrics(p, i, prep, tally, phase, ends);
         p.seen[i] = (unsigned char)(seen >> a & 1);
         p.blind[i] = (unsigned char)(team && is_prep);
         write_state(p, walls, env, a, age);
@@ -318,11 +323,11 @@ struct HideAndSeekMovesParams {
     const long long* actions;    // (B)
     const int* ages;             // (B)
     const unsigned char* ended;  // (B)
+    const int* preps;            // (N) steps of the preparation
     long long* out;              // (B)
     int n_lanes;                 // B
     int n_agents;                // A
     int n_hiders;
-    int prep;
 };
 
 // The action by which a lane moves. One outside of the action space stays, for physics to flag.
@@ -330,7 +335,7 @@ HD long long move_of(const HideAndSeekMovesParams& p, int i) {
     long long action = p.actions[i];
     if (action < 0 || action > LOCK)
         return action;
-    int waits = p.ages[i] < p.prep && i % p.n_agents >= p.n_hiders;
+    int waits = p.ages[i] < p.preps[i / p.n_agents] && i % p.n_agents >= p.n_hiders;
     return p.ended[i] || waits || action >= GRAB ? 0 : action;
 }
 
