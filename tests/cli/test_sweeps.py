@@ -284,6 +284,20 @@ def test_job_that_ends_its_process_leaves_the_others(here):
     assert "job 1: Training on cpu in mine/1_env.mood=fine" in out
 
 
+@pytest.mark.slow
+def test_jobs_with_ranks_train_as_alone_and_a_lost_rank_fails_its_job_only(here):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = *SMALL, f"samples={4 * UPDATE}", "ranks=2", "env.pay=2"
+    code, out, err = finished("train", *words, "-m", "env.mood=lost,fine", *JOBLIB)
+    assert code == 1 and "rank 1 on " in err and "Traceback" not in err, err
+    lost, fine = rows("mine")
+    assert lost["state"].startswith("FAILED: rank 1 on ")
+    assert fine["state"] == "done" and float(fine["score"]) == 8
+    assert finished("train", *words, "folder=alone")[0] == 0
+    metrics = (pathlib.Path(folder) / "metrics.jsonl" for folder in (fine["folder"], "alone"))
+    assert len({path.read_bytes() for path in metrics}) == 1
+
+
 # ---- Where jobs run ----
 
 
