@@ -1,7 +1,7 @@
 """The gradient steps of an update. Non-finite steps are skipped and counted."""
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import torch
 from torch.autograd.graph import _engine_run_backward as run_backward
@@ -56,9 +56,7 @@ def _fits(steps, *_) -> bool:
 
 
 @torch.no_grad()
-def _average_on_gpu(
-    parameters, n_valid, means: Sequence[torch.Tensor] = ()
-) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def _average_on_gpu(parameters, n_valid, means=()) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Fills the bucket in one kernel, and divides it in another."""
     device, n_valid = n_valid.device, n_valid.long()
     held = [p for p in parameters if p.grad is not None]

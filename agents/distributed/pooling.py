@@ -86,10 +86,9 @@ def pool_with_condition(
     """Returns whether a condition, () bool, is true on every rank, and the pooled moments."""
     if n_pooled() == 1:
         return condition, list(moments)
-    one = torch.ones_like(condition, dtype=torch.int64)
-    is_false = (~condition).float()
-    (_, fraction_false, _), *pooled = pool_moments((one, is_false, is_false), *moments)
-    return fraction_false == 0, pooled
+    unused = condition.float()
+    (n_true, *_), *pooled = pool_moments((condition.long(), unused, unused), *moments)
+    return n_true == n_ranks(), pooled
 
 
 def average_gradients(
