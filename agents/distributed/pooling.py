@@ -70,7 +70,6 @@ def pool_moments(*moments: Moments) -> list[Moments]:
     divisor = counts.sum(0).clamp(min=1)
     mean = (counts * means).sum(0) / divisor
     variance = (counts * (variances + (means - mean).square())).sum(0) / divisor
-    # all in one, and then those of another type
     mean, variance = mean.to(statistics.dtype), variance.to(statistics.dtype)
     pooled = zip(n, mean.split(sizes), variance.split(sizes), strict=True)
     moments_of_all = [
@@ -114,17 +113,12 @@ def average_gradients(
         return n_valid, means
     with torch.no_grad():
         held = [(p, p.grad) for p in parameters if p.grad is not None]
-        gradients = [gradient.flatten() for _, gradient in held]
-        numbers = [number.float() for number in [*means, n_valid]]
-        # one buffer; each gradient starts at a multiple of 16 bytes, for Adam's vector loads
-        sizes = [n + -n % 4 for n in map(len, gradients)]
-        bucket = torch.empty(sum(sizes) + len(numbers), device=n_valid.device)
-        *parts, pooled = bucket.split([*sizes, len(numbers)])
-        parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
-        torch._foreach_copy_([*parts, *pooled.unbind()], [*gradients, *numbers])  # pyright: ignore[reportPrivateImportUsage]
+        numbers = torch.stack([number.float() for number in [*means, n_valid]])
+        bucket = torch.cat([*(gradient.flatten() for _, gradient in held), numbers])
         bucket[:-1] *= n_valid
         n = all_reduce(bucket)[-1]
         bucket[:-1] /= n.clamp(min=1)
+        *parts, pooled = bucket.split([*(p.numel() for p, _ in held), len(numbers)])
         for (p, _), part in zip(held, parts, strict=True):
             p.grad = part.view_as(p)
     return n, list(pooled[:-1].unbind())

@@ -13,9 +13,7 @@ from training import rates, trained
 N_ROUNDS = 2
 #: Per GPU, enough for several reports: 4 to 6 s.
 SAMPLES = {"cuda": 70_000_000, "cpu": 100_000}
-#: Environments with default settings, and an experiment.
 NAMES = "explorer", "pointgoal", "experiment=memory_9"
-NO_FINISH = "finish.evaluate=false", "finish.record=false"
 
 
 def scaling(device: torch.device, envs: list[str] | None = None) -> Iterator[dict]:
@@ -28,8 +26,9 @@ def scaling(device: torch.device, envs: list[str] | None = None) -> Iterator[dic
         for _ in range(N_ROUNDS):
             for n, found in by_count.items():
                 samples = n * SAMPLES[device.type]
-                words = name if "=" in name else f"env={name}", f"ranks={n}", f"samples={samples}"
-                with trained(device, (*words, f"device={device.type}", *NO_FINISH)) as (run,):
+                words = [name if "=" in name else f"env={name}", f"ranks={n}", f"samples={samples}"]
+                words += [f"device={device.type}", "finish.evaluate=false", "finish.record=false"]
+                with trained(device, (*words,)) as (run,):
                     found.append(statistics.median(rates(run)) / 1e6)
         one = statistics.median(by_count[1])
         for n, found in by_count.items():
