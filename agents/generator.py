@@ -13,9 +13,11 @@ def stream_seed(seed: int, name: str) -> int:
     return int.from_bytes(digest[:8], "little") >> 1
 
 
-def rank_seed(seed: int, rank: int) -> int:
-    """Returns the run's seed for rank 0, for each other one of its own, below 2**31."""
-    return seed if rank == 0 else stream_seed(seed, f"rank {rank}") % 2**31
+def seed_of(kind: str, number: int, seed: int) -> int:
+    """Returns the seed of a "rank" or a "member" of a run: of number 0 the run's, of each other one
+    its own, below 2**31.
+    """
+    return seed if number == 0 else stream_seed(seed, f"{kind} {number}") % 2**31
 
 
 class SeededGenerator:

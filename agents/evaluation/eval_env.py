@@ -14,7 +14,7 @@ from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing
 from megastep.agents.factory import components, settings
 from megastep.agents.factory import make as factory
-from megastep.agents.generator import rank_seed
+from megastep.agents.generator import seed_of
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.mixed_policy import rotating_teams, teams_of
@@ -102,7 +102,7 @@ class EvalEnv:
         is_duel: bool = False,
     ):
         env = settings.changed_known(env, **(FOR_TWO if is_duel else {"resample": False}))
-        self.seed = rank_seed(seed, process_group.rank() if is_shared else 0)
+        self.seed = seed_of("rank", process_group.rank() if is_shared else 0, seed)
         self.sample = factory.make_sample(env, [*homes], seed=self.seed, device=device)
         n_agents, teams = optional(self.sample, "n_agents"), teams_of(self.sample)
         if is_duel:

@@ -17,7 +17,7 @@ from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.factory import check, conflicts, settings
 from megastep.agents.factory import make as factory
-from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
+from megastep.agents.generator import SeededGenerator, seed_of, stream_seed
 from megastep.agents.runs import agent_file, checkpoint, folders, provenance, restore
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training import budget, loggers
@@ -50,7 +50,7 @@ def make_trainer(
         n_members: trainers of a population that memory is to hold from this one on.
     """
     number, n_ranks = ranks = world() if ranks is None else ranks
-    seed = rank_seed(cfg.seed, number)
+    seed = seed_of("rank", number, cfg.seed)
     of_users = stream_seed(seed, "global")  # which only code of theirs draws from
     torch.manual_seed(of_users)
     np.random.seed(of_users % 2**32)

@@ -17,6 +17,7 @@ from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import make as factory
 from megastep.agents.factory import settings
 from megastep.agents.factory.trainer import make_trainer
+from megastep.agents.generator import seed_of
 from megastep.agents.launch import again, finishing
 from megastep.agents.launch.run import Run, evaluations, record
 from megastep.agents.population import decisions
@@ -150,7 +151,7 @@ def member_settings(cfg: settings.Train, member: int) -> settings.Train:
     rerun = cfg.rerun and str(populations.folder_of(Path(cfg.rerun), member))
     return settings.changed(
         cfg,
-        seed=decisions.member_seed(seed, member),
+        seed=seed_of("member", member, seed),
         rerun=rerun,
         population=settings.changed(cfg.population, member=member),
         checkpoints=settings.changed(cfg.checkpoints, keep=max(KEPT, cfg.checkpoints.keep)),

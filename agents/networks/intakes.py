@@ -31,18 +31,14 @@ _ROWS = LIBRARY.constants["NORMALISED_ROWS"]
 # ---- Encoders of a leaf ----
 
 
-class Flat(nn.Module):
+class Flat(nn.Flatten):
     """Flattens a vector or an image: (..., *shape) -> (..., n_features)."""
 
     takes_parts = True
 
     def __init__(self, space: Space):
-        super().__init__()
-        self.n_axes = len(space.shape)
+        super().__init__(-len(space.shape))
         self.n_features = math.prod(space.shape)
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return obs.flatten(-self.n_axes)
 
 
 class OneHot(nn.Module):

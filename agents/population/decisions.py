@@ -20,11 +20,6 @@ class Decision(NamedTuple):
     settings: Settings  # its settings from then on, by key
 
 
-def member_seed(seed: int, member: int) -> int:
-    """Returns the seed of a member's run: for others than 0 one of its own, below 2**31."""
-    return seed if member == 0 else stream_seed(seed, f"member {member}") % 2**31
-
-
 def first(seed: int, member: int, vary: Mapping[str, Variation]) -> Settings:
     """Returns the settings with which a member begins."""
     generator = _generator(seed, 0, member)

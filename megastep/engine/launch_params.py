@@ -142,7 +142,7 @@ def lanes_of(scenery: Scenery, agents: Agents) -> tuple[int, int]:
     return scenery.n_envs, scenery.n_agents
 
 
-def seed_params(seed: int) -> dict[str, int]:
+def seed_params(seed: int) -> dict[str, Any]:
     """Returns a 64-bit seed as the two words of a generator's key."""
     seed = checks.integer("seed", seed, 0, 2**64 - 1)
     return dict(key0=seed & 0xFFFFFFFF, key1=seed >> 32)

@@ -8,11 +8,7 @@ from megastep import geometry
 from megastep.dotdict import dotdict
 
 CORNER = 1.0  # metres; x and y of the lower-left corner of every toy
-
-
-def _square(left, width) -> np.ndarray:
-    """Returns the corners, (4, 2) anticlockwise, of a square from (left, left)."""
-    return left + width * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])  # anticlockwise
 
 
 def _toy(rings, lights) -> dotdict:
@@ -37,7 +33,7 @@ def box(width: float = 5) -> dotdict:
     Its lower-left corner is at (1, 1), so by default its walls run from 1 to 6.
     """
     _validate("width", width, 1, geometry.MAX_EXTENT - CORNER)
-    return _toy([_square(CORNER, width)], [[CORNER + width / 2] * 2])
+    return _toy([CORNER + width * SQUARE], [[CORNER + width / 2] * 2])
 
 
 def column(width: float = 5, pillar: float = 1) -> dotdict:
@@ -46,6 +42,7 @@ def column(width: float = 5, pillar: float = 1) -> dotdict:
     """
     _validate("width", width, 2, geometry.MAX_EXTENT - CORNER)
     _validate("pillar", pillar, 0.01, width - 1)
-    rings = [_square(CORNER, width), _square(CORNER + (width - pillar) / 2, pillar)[::-1]]
+    around = CORNER + (width - pillar) / 2 + pillar * SQUARE
+    rings = [CORNER + width * SQUARE, around[::-1]]
     near = (width - pillar) / 4
     return _toy(rings, [[CORNER + near] * 2, [CORNER + width - near] * 2])

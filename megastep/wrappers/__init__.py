@@ -12,22 +12,6 @@ from megastep.wrappers.worlds import (
     ShapeReward,
 )
 
-__all__ = [
-    "WRAPPERS",
-    "ClipReward",
-    "DropSensor",
-    "FrameStack",
-    "Latency",
-    "NoisyActions",
-    "NoisySensor",
-    "OdometryDrift",
-    "ScaleReward",
-    "ShapeReward",
-    "StickyActions",
-    "TimeLimit",
-    "Wrapper",
-]
-
 #: Wrappers by their names in settings.
 WRAPPERS = {
     "clip_reward": ClipReward,
@@ -42,3 +26,5 @@ WRAPPERS = {
     "sticky_actions": StickyActions,
     "time_limit": TimeLimit,
 }
+
+__all__ = ["WRAPPERS", "Wrapper", *(kind.__name__ for kind in WRAPPERS.values())]

@@ -7,7 +7,7 @@ from megastep.agents.distributed import environment, process_group, ranks
 from megastep.agents.distributed.process_group import together
 from megastep.agents.distributed.ranks import ONE, Plan, Ranks
 from megastep.agents.errors import UserError
-from megastep.agents.generator import rank_seed
+from megastep.agents.generator import seed_of
 
 GOES_ON = Plan(goes_on=True, saves=False, lr_fraction=0.75)
 
@@ -39,9 +39,9 @@ def test_contradicting_variables(monkeypatch, values):
 
 
 def test_each_rank_has_a_seed_of_its_own():
-    seeds = [rank_seed(7, rank) for rank in range(100)]
+    seeds = [seed_of("rank", rank, 7) for rank in range(100)]
     assert seeds[0] == 7 and len({*seeds}) == 100 and max(seeds) < 2**31
-    assert not {*seeds} & {rank_seed(8, rank) for rank in range(100)}
+    assert not {*seeds} & {seed_of("rank", rank, 8) for rank in range(100)}
 
 
 # ---- Plans and calls ----

@@ -6,7 +6,8 @@ from collections import Counter
 
 import pytest
 
-from megastep.agents.population.decisions import decide, first, member_seed, order
+from megastep.agents.generator import seed_of
+from megastep.agents.population.decisions import decide, first, order
 from megastep.agents.population.variation import Variation
 
 VARY = {
@@ -57,7 +58,8 @@ def test_draws_depend_on_seed_generation_and_member_alone():
     assert decide(1, 5, SCORES, SETTINGS, VARY) == decide(1, 5, SCORES, SETTINGS, VARY)
     drawn = [math.log10(first(1, n, VARY)["learner.lr"]) for n in range(1000)]
     assert sum(drawn) / 1000 == pytest.approx((math.log10(3e-4) + math.log10(3e-3)) / 2, abs=0.03)
-    assert member_seed(7, 0) == 7 and len({member_seed(7, n) for n in range(1000)}) == 1000
+    seeds = [seed_of("member", n, 7) for n in range(1000)]
+    assert seeds[0] == 7 and len({*seeds}) == 1000
 
 
 def test_a_step_stays_within_the_bounds():

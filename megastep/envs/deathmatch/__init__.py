@@ -210,7 +210,7 @@ class Deathmatch(FirstPerson):
     def _world(self, **rules) -> arrdict:
         """Respawns agents whose episode has ended, renders, and lets the agents hit each other."""
         self.spawner(self.ended)
-        search = {}
+        search: dict = {}
         if self.seen is not None:  # counts newly seen texels
             search = dict(seen=self.seen, clear_mask=self.ended.view(self.n_envs, self.n_agents))
         view = self._view(centre_line=True, agent_ray=self.has_aim, **search)
