@@ -25,6 +25,17 @@ from megastep.dotdict import dotdict
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+__all__ = [
+    "components",
+    "centers",
+    "contents",
+    "display",
+    "indices",
+    "masks",
+    "mirror_image",
+    "validate_geometry",
+]
+
 G = TypeVar("G", bound=dict)
 
 # Metres per cell, as in the original: coarse enough to be cheap, fine enough for a 0.6 m door.

@@ -18,6 +18,8 @@ from megastep.read_only import SetOnce
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+__all__ = ["Ragged", "RaggedNumpy", "RaggedTorch"]
+
 Array = np.ndarray | torch.Tensor
 
 
