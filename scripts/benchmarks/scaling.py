@@ -11,8 +11,8 @@ from timing import measurement
 from training import rates, trained
 
 N_ROUNDS = 2
-#: Per GPU, enough for several reports: 4 to 6 s.
-SAMPLES = {"cuda": 70_000_000, "cpu": 100_000}
+#: Per GPU, enough for several reports: 3 to 5 s.
+SAMPLES = {"cuda": 60_000_000, "cpu": 100_000}
 NAMES = "explorer", "pointgoal", "experiment=memory_9"
 
 
