@@ -106,20 +106,12 @@ def _part(geometries, name, shape) -> list:
     return parts
 
 
-def _first_layouts(n_envs, n_layouts) -> torch.Tensor:
-    """Returns the layout that each environment starts with, (N,) int64."""
-    environments = torch.arange(n_envs)
-    if n_envs < n_layouts:
-        return environments * n_layouts // n_envs
-    return environments % n_layouts
-
-
 def spread(geometries: Sequence, n_envs: int) -> list:
     """Returns the geometries that ``n_envs`` environments start in: all, or evenly spaced ones."""
     n_envs = checks.integer("n_envs", n_envs, 1)
-    n_geometries = len(checks.items("geometries", geometries))
-    indices = _first_layouts(min(n_envs, n_geometries), n_geometries).tolist()
-    return [geometries[i] for i in indices]
+    n_layouts = len(checks.items("geometries", geometries))
+    n_shown = min(n_envs, n_layouts)
+    return [geometries[e * n_layouts // n_shown] for e in range(n_shown)]
 
 
 def scenery(
@@ -174,7 +166,8 @@ def scenery(
         ),
         device=device,
     )
-    layout = _first_layouts(n_envs, len(geometries))
+    n_layouts = len(geometries)  # all are shown, or evenly spaced ones
+    layout = torch.arange(n_envs) * n_layouts // min(n_envs, n_layouts) % n_layouts
     result = Scenery(n_agents, layouts, model, model_widths, layout)
     bake_cached(result)
     return result
