@@ -21,7 +21,7 @@ import pathlib
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -30,11 +30,8 @@ from numpy.typing import ArrayLike
 from megastep import plotting
 from megastep.arrdict import clone, numpyify
 from megastep.atomic_files import write_atomically
-from megastep.types import Tree, n_lanes, optional
+from megastep.types import Env, PolicyLike, Tree, n_lanes, optional
 from megastep.video import WRITERS, GifWriter, Mp4Writer, as_image
-
-if TYPE_CHECKING:
-    from megastep.types import Env, PolicyLike
 
 __all__ = ["Film", "ParallelEncoder", "Player", "film", "film_all"]
 

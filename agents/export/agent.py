@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import torch
 
@@ -30,11 +30,9 @@ from megastep.agents.runs import (
     trust,
     typed_json,
 )
+from megastep.agents.types import Config, Row
 from megastep.atomic_files import write_atomically
 from megastep.types import Env
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Config, Row
 
 #: Settings of a run that are of no use to others, or name files of the machine that trained it.
 PRIVATE = dict(

@@ -15,7 +15,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import nn
@@ -27,14 +27,12 @@ from megastep.agents.factory import components
 from megastep.agents.factory import make as factory
 from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.heads import FORBIDDEN
+from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import folders, restore
 from megastep.arrdict import arrdict
 from megastep.atomic_files import write_atomically
 from megastep.dotdict import leaves, mapping
 from megastep.types import Env, Tree, World, n_lanes, optional
-
-if TYPE_CHECKING:
-    from megastep.agents.networks.policy import Policy
 
 FLOAT = torch.float32  # of the floating-point inputs
 #: Version of ONNX's operators.
@@ -63,7 +61,7 @@ class Step(nn.Module):
     an example of what it sees.
     """
 
-    def __init__(self, policy: "Policy", world: World):
+    def __init__(self, policy: Policy, world: World):
         super().__init__()
         self.policy = policy.actor().eval()
         self.masks = [*spaces.leaves(world["mask"])] if "mask" in world else []
@@ -232,7 +230,7 @@ def runner(path: Path) -> Runner:
 
 @torch.no_grad()
 def compare(
-    step: Step, run: Runner, policy: "Policy", env: Env, name: object, n_steps: int = 1000
+    step: Step, run: Runner, policy: Policy, env: Env, name: object, n_steps: int = 1000
 ) -> float:
     """Returns how far apart the numbers of a file and of a policy are in the same worlds, with more
     resets than the environment's own. UserError if the file acts otherwise.

@@ -4,17 +4,13 @@ Each is a file NAME.safetensors in this folder, with a card NAME.md beside it. O
 its name stands for a run: `evaluate.py run=NAME`; in Python `megastep.load(NAME)` does.
 """
 
-from typing import TYPE_CHECKING
-
 from megastep import devices
 from megastep.agents.errors import user_errors
+from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import folders, restore
 
-if TYPE_CHECKING:
-    from megastep.agents.networks.policy import Policy
 
-
-def load(name: str, device: str = "auto") -> "Policy":
+def load(name: str, device: str = "auto") -> Policy:
     """Returns a trained policy, ready to act: `decision, state = policy(world, state)`. Raises
     UserError: there is none; or it names modules outside megastep that you have not trained with
     here.

@@ -14,15 +14,12 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from megastep import cache
 from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary, kernels
-
-if TYPE_CHECKING:
-    from ctypes import CDLL
 
 
 class EngineError(RuntimeError):
@@ -59,7 +56,7 @@ def cpu(library: KernelLibrary) -> dict[str, Callable[[bytes], None]]:
     return functions
 
 
-def end_threads_at_forks(library: "CDLL") -> None:
+def end_threads_at_forks(library: ctypes.CDLL) -> None:
     """Has the OpenMP runtime of a library, if any, end its threads before each ``os.fork``; new
     ones start when they are needed, with the same bits. A fork copies only the thread that calls
     it, and GNU OpenMP does not notice: the first parallel loop of the child would wait forever.
@@ -111,7 +108,7 @@ def _build_cpu(library, command) -> bytes:
         return out.read_bytes()
 
 
-def _load(name, body, path) -> "CDLL":
+def _load(name, body, path) -> ctypes.CDLL:
     """Loads a shared library from its cached file or, without a cache, from a temporary copy."""
     if path is not None:
         try:
