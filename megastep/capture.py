@@ -18,15 +18,7 @@ from typing import Any, cast
 import torch
 from torch.utils import _pytree
 
-from megastep.engine.state_tree import (
-    SCALARS,
-    node_at,
-    rebind,
-    restore,
-    snapshot,
-    state_tree,
-    walk,
-)
+from megastep.engine.state_tree import SCALARS, node_at, rebind, restore, snapshot, state_tree, walk
 from megastep.env_state import GENERATORS, LARGE, EnvState, as_bytes, name_of
 from megastep.types import Env, World, optional
 

@@ -76,10 +76,7 @@ def _frozen(kind: type, is_finite=True, is_strict=False) -> Any:
         own = inspect.get_annotations(kind)
         kind.__annotations__ = {name: _strict(hints[name]) for name in own}
     config = pydantic.ConfigDict(
-        strict=is_strict,
-        extra="forbid",
-        allow_inf_nan=not is_finite,
-        arbitrary_types_allowed=True,
+        strict=is_strict, extra="forbid", allow_inf_nan=not is_finite, arbitrary_types_allowed=True
     )
     return pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=config)(kind)
 

@@ -19,12 +19,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import masked_moments
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
-from megastep.agents.storage.replay import (
-    ReplayBuffer,
-    ReplaySettings,
-    defaults_from,
-    replay_size,
-)
+from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings, defaults_from, replay_size
 from megastep.agents.storage.rollout import copy_tree, make_rollout, without_last
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict

@@ -26,12 +26,7 @@ from megastep.agents.networks.linear import (
     product,
     sum_rows,
 )
-from megastep.agents.networks.running_norm import (
-    RESOLUTION,
-    masked_moments,
-    mix_moments,
-    store_if,
-)
+from megastep.agents.networks.running_norm import RESOLUTION, masked_moments, mix_moments, store_if
 from megastep.agents.types import Moments
 from megastep.kernels.build.launch import WARP, Blocks, launch
 from megastep.types import Space, Tree

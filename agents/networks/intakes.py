@@ -14,12 +14,7 @@ from torch import nn
 from megastep import spaces
 from megastep.agents.networks.fused import LIBRARY, fused
 from megastep.agents.networks.linear import ACTIVATIONS, compute_dtype, linear
-from megastep.agents.networks.running_norm import (
-    MAX_LEAVES,
-    RunningNorm,
-    are_readable,
-    packed_leaf,
-)
+from megastep.agents.networks.running_norm import MAX_LEAVES, RunningNorm, are_readable, packed_leaf
 from megastep.imports import resolve
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.types import Space, Tree

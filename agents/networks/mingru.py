@@ -22,13 +22,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks import step
-from megastep.agents.networks.fused import (
-    DTYPES,
-    LIBRARY,
-    aligned,
-    check_shapes,
-    fused,
-)
+from megastep.agents.networks.fused import DTYPES, LIBRARY, aligned, check_shapes, fused
 from megastep.agents.networks.linear import (
     cast,
     compute_dtype,

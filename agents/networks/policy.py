@@ -178,12 +178,7 @@ class Policy(nn.Module):
         return decision
 
     def unroll(
-        self,
-        obs: Tree,
-        reset: torch.Tensor,
-        state: arrdict,
-        burn_in: int = 0,
-        mask: Tree = None,
+        self, obs: Tree, reset: torch.Tensor, state: arrdict, burn_in: int = 0, mask: Tree = None
     ) -> arrdict:
         """Runs over a sequence without acting. Returns arrdict(logits (T, B, ...), features
         (T, B, width), state after the sequence).

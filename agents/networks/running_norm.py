@@ -159,9 +159,7 @@ def _add_on_gpu(norms, moments, is_counted=None) -> None:
     ),
 )
 def add_moments(
-    norms: Sequence[RunningNorm],
-    moments: Sequence[Moments],
-    is_counted: torch.Tensor | None = None,
+    norms: Sequence[RunningNorm], moments: Sequence[Moments], is_counted: torch.Tensor | None = None
 ) -> None:
     """Adds moments to the statistics of each norm, the n-th call with weight 1/n. Changes nothing
     if no lane was counted, a mean or variance is not finite, or `is_counted`, () bool, is false.

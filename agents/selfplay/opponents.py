@@ -13,12 +13,7 @@ from pydantic import Field, SkipValidation
 
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
-from megastep.agents.selfplay.mixed_policy import (
-    MixedPolicy,
-    rotating_teams,
-    score_pairs,
-    teams_of,
-)
+from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_teams, score_pairs, teams_of
 from megastep.agents.storage.rollout import copy_tree
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict

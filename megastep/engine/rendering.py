@@ -155,11 +155,7 @@ def observe(
 
 
 def scan(
-    scenery: Scenery,
-    agents: Agents,
-    n_rays: int,
-    range_min: float = 0.0,
-    range_max: float = LIMIT,
+    scenery: Scenery, agents: Agents, n_rays: int, range_min: float = 0.0, range_max: float = LIMIT
 ) -> torch.Tensor:
     """Returns the metres to the nearest wall along rays around each agent, (N, A, n_rays), with the
     meaning of ROS's LaserScan (REP 117): ray 0 looks ahead, along +x, the others follow

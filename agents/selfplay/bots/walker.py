@@ -9,14 +9,7 @@ from typing import Any
 import torch
 
 from megastep.agents.selfplay.bots.plans import BLOCKED
-from megastep.agents.selfplay.bots.steering import (
-    HORIZON,
-    SIGHT,
-    SLACK,
-    Pose,
-    SteeredBot,
-    Steering,
-)
+from megastep.agents.selfplay.bots.steering import HORIZON, SIGHT, SLACK, Pose, SteeredBot, Steering
 from megastep.agents.selfplay.mixed_policy import teams_of
 from megastep.arrdict import arrdict
 
