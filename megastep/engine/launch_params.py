@@ -3,6 +3,7 @@ synchronisation.
 """
 
 import ctypes
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -20,13 +21,12 @@ _STATE = dict(positions=(2,), angles=(), velocity=(2,), angvelocity=())
 POSE, MOTION = ("positions", "angles"), (*_STATE,)
 
 
+@dataclass(slots=True, eq=False)
 class _Cached:
     """What was last computed from a key; without a ``__dict__``, so that no checkpoint has it."""
 
-    __slots__ = ("key", "value")
-
-    def __init__(self, key: Any, value: Any):
-        self.key, self.value = key, value
+    key: Any
+    value: Any
 
 
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
