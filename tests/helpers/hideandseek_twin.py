@@ -149,9 +149,10 @@ class Twin:
 
     def state(self, a, age):
         env, m = self.env, self.mine
-        k, own, is_prep = self.target(a), int(a >= env.n_hiders), age < m["preps"]
-        play = env.limit - int(m["preps"])
-        left = (env.prep - age) / env.prep if is_prep else (env.limit - age) / play
+        k, own, is_prep = self.target(a), int(a >= env.n_hiders), age < env.prep
+        left = (
+            (env.prep - age) / env.prep if is_prep else (env.limit - age) / (env.limit - env.prep)
+        )
         body = [False] * 5
         if k >= 0:
             holds, owner = int(m["holders"][k]) == a, int(m["owners"][k])

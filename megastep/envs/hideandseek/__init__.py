@@ -106,8 +106,7 @@ class HideAndSeek(FirstPerson):
         limit: steps of an episode.
         prep: steps of its preparation. Default: a third in the quadrant, two fifths in homes.
         min_prep: if given, each episode's preparation ends after a random number of steps from this
-            to ``prep``. Agents still see the fraction of ``prep`` that is left, so hiders cannot
-            wait until shortly before seekers come.
+            to ``prep``. ``state`` is as if it lasted ``prep``, so hiders cannot wait for its end.
         movable: if False, nothing moves the boxes and ramps.
         grab_elevated: agents that have driven up a ramp may grab, and so ride on boxes.
         resample: if True, each episode takes place in a randomly drawn floor plan. Otherwise an

@@ -188,13 +188,13 @@ HD void measure_all(const HideAndSeekStepParams& p, int env, float* out) {
     measure(p, env, n_boxes, p.objects.n_bodies, out + 2);
 }
 
-// What agent a knows: its team, the preparation, the fraction of the phase that is left, if the
-// preparation is as long as it can be; whether it is elevated, holds a body; of the body that it
-// would grab or lock, whether there is one, it is locked by its own team or the other one, or
+// What agent a knows: its team, the preparation, the fraction of the phase that is left, both as if
+// the preparation were as long as it can be; whether it is elevated, holds a body; of the body that
+// it would grab or lock, whether there is one, it is locked by its own team or the other one, or
 // another agent holds it.
 HD void write_state(const HideAndSeekStepParams& p, const Walls& walls, int env, int a, int age) {
-    int target = target_of(p, walls, env, a), team = a >= p.n_hiders, is_prep = age < p.preps[env];
-    int left = (is_prep ? p.prep : p.limit) - age, of = is_prep ? p.prep : p.limit - p.preps[env];
+    int target = target_of(p, walls, env, a), team = a >= p.n_hiders, is_prep = age < p.prep;
+    int left = (is_prep ? p.prep : p.limit) - age, of = is_prep ? p.prep : p.limit - p.prep;
     Body body = {};
     if (target >= 0)
         body = bodies_of(p.objects, env)[target];
