@@ -181,7 +181,7 @@ class EnvState:
                     self._set_tensor(path, now, value, device, written)
 
     def _set_value(self, path, now, value) -> None:
-        if type(now) is type(value) and now == value:
+        if type(now) is type(value) and _is_plain(now) and now == value:
             return  # it may be in a tuple
         if type(now) is type(value) and isinstance(now, (*_LISTS, dict, set)):
             now.clear()

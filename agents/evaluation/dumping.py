@@ -28,6 +28,7 @@ from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import Rollout, copy_tree
+from megastep.agents.training.callbacks import close_env
 from megastep.arrdict import arrdict
 from megastep.atomic_files import delete, write_atomically
 from megastep.data import episodes, formats
@@ -223,7 +224,7 @@ class Waves:
             world = self.told.reset(seed=seed)
         else:
             if wave:
-                optional(self.told.env, "close")()
+                close_env(self.told.env)
                 self._make(seed=seed % 2**31)
             world = self.told.reset()
         device = world["reset"].device

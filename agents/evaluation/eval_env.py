@@ -18,6 +18,7 @@ from megastep.agents.generator import seed_of
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.mixed_policy import rotating_teams, teams_of
+from megastep.agents.training.callbacks import close_env
 from megastep.arrdict import arrdict, cat
 from megastep.env_state import way_back
 from megastep.types import Env, PolicyLike, optional
@@ -151,7 +152,7 @@ class EvalEnv:
         if not self._is_used:
             self._go_back = way_back(self.env) if optional(self.env, "resumable") else None
         elif not self._went_back():
-            optional(self.env, "close")()
+            close_env(self.env)
             self.env, self._go_back = self._made(), None
             policies = [factory.in_env(policy, self.settings, self.env) for policy in policies]
         self._is_used = True

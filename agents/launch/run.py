@@ -25,8 +25,9 @@ from megastep.agents.launch import again, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training.budget import reaches
 from megastep.agents.training.callbacks import Progress
+from megastep.agents.training.episode_stats import LONGEST
 from megastep.agents.training.trainer import Trainer
-from megastep.types import DEFAULTS, optional
+from megastep.types import optional
 
 if TYPE_CHECKING:
     from megastep.agents.launch.watch import Team
@@ -214,7 +215,7 @@ class Run:
         n_steps = trainer.samples // n_lanes
         length = f"more than {int(trainer.episodes.stats.totals[1].max())}"
         most = getattr(trainer.env, "limit", None) or optional(trainer.env, "max_episode_steps")
-        if isinstance(most, int) and most < DEFAULTS["max_episode_steps"]:
+        if isinstance(most, int) and most < LONGEST:
             length, n_steps = f"up to {most}", max(n_steps, most)
         return (  # twice as many, since the first episodes begin at random ages
             f"no mean return yet: an episode has {length} steps, and each of {n_lanes} lanes took "

@@ -48,12 +48,13 @@ def write(
 
     if file.suffix not in FORMATS:
         raise UserError(f"file={file} is not a plot; its name ends with {', '.join(FORMATS)}")
-    every = [*map(runs.read, paths)]
+    groups, left_out = runs.without_interrupted(runs.groups_of([*map(runs.read, paths)]))
+    every = [run for group in groups.values() for run in group]
     if metric not in (shared := runs.metrics_of(every)):
         if not shared:
             raise UserError("these runs share no metric, so they cannot be compared")
-        raise UserError(f"not all of these runs report {metric!r}; {closest(metric, shared)}")
-    groups, left_out = runs.without_interrupted(runs.groups_of(every))
+        lacking = ", ".join(str(run.folder) for run in every if metric not in run.names())
+        raise UserError(f"{lacking} did not report {metric!r}; {closest(metric, shared)}")
     labels = [*groups] if labels is None else labels
     if len(dict.fromkeys(labels)) != len(groups):
         raise UserError(f"labels= takes {len(groups)} different ones here, for {', '.join(groups)}")

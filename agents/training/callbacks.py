@@ -75,14 +75,19 @@ class Callbacks(list[Any]):
         return results
 
     def close(self, env: Env) -> None:
-        """Closes an environment, which may fail at it, then the objects that have `close`."""
-        try:
-            optional(env, "close")()
-        except Exception as error:
-            reason = f"{type(error).__name__}: {error}".partition("\n")[0]
-            warnings.warn(f"The environment could not be closed: {reason}", stacklevel=2)
+        """Closes an environment, then the objects that have `close`."""
+        close_env(env)
         for one in self:
             getattr(one, "close", lambda: None)()
+
+
+def close_env(env: Env) -> None:
+    """Closes an environment. Warns if that fails."""
+    try:
+        optional(env, "close")()
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+        warnings.warn(f"The environment could not be closed: {reason}", stacklevel=2)
 
 
 class Losses:

@@ -123,5 +123,5 @@ def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, seed) -> Any:
         vector = HostedEnvs(make, n_envs, found=probe(make), seed=seed)
     else:
         vector = VectorProcesses(make, n_envs, seed)
-    vector.max_episode_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
+    vector.max_episode_steps = kwargs.get("max_episode_steps", spec.max_episode_steps)
     return vector

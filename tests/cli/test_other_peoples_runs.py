@@ -65,7 +65,7 @@ def test_own_class_that_fails(here, capsys):
 
 
 def test_environment_that_cannot_be_closed_is_a_warning(here, capsys):
-    words = [*WORDS, env_id("CloseFails"), "samples=64", "folder=run"]
+    words = [*WORDS, env_id("CloseFails"), "samples=64", "folder=run", "env.vectorization=async"]
     assert train.main([*words, "finish.evaluate=true", "finish.episodes=4"]) == 0
     assert "warning: The environment could not be closed: " in capsys.readouterr().err
     assert len([*here.glob("run/evaluations/*.json")]) == 1

@@ -13,7 +13,7 @@ import torch
 
 from megastep import contract
 from megastep.arrdict import arrdict
-from megastep.env_state import EnvState
+from megastep.env_state import EnvState, way_back
 from megastep.envs import Gymnasium
 from megastep.hosting.env_error import EnvError
 
@@ -225,6 +225,15 @@ def test_state_is_restored_exactly(name):
     worlds = [resumed.step(one) for one in actions]
     assert all(map(contract.same, worlds, expected))
     assert any(world.reset.any() for world in worlds)
+
+
+def test_goes_back_to_before_its_first_reset():
+    env = cart_pole()
+    assert env.max_episode_steps == 500
+    go_back = way_back(env)
+    worlds = contract.rollout(env, 30)
+    go_back()
+    assert all(map(contract.same, contract.rollout(env, 30), worlds))
 
 
 def test_resumable_if_all_state_is_in_python():

@@ -164,7 +164,7 @@ def test_an_interrupted_seed_is_left_out_and_named(here, tmp_path, capsys):
     for name in "ab":
         shutil.copytree(here / name, tmp_path / f"${name}$_")
     path = tmp_path / "$b$_/metrics.jsonl"
-    path.write_text(path.read_text().splitlines(keepends=True)[0])
+    path.write_text(path.read_text().splitlines(keepends=True)[0].replace("entropy", "other"))
     samples = json_lines.read(path)[0]["samples"]
     names = [str(tmp_path / f"${name}$_") for name in "ab"]
     plot = write_plot([*map(Path, names)], tmp_path / "plot.svg", "loss/entropy")
