@@ -1,67 +1,21 @@
-"""Copies and index selections of many tensors in one kernel."""
+"""Copies and index selections of many tensors, each in one kernel."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
+from megastep.kernels.build.copies import MAX_BYTES
+from megastep.kernels.build.copies import copy_all as copy_all
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.types import Tree
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
-_MAX_COPIES = LIBRARY.constants["MAX_COPIES"]
 _BLOCK_WORDS = BLOCK * LIBRARY.constants["COPY_WORDS"]
-_BLOCK_BYTES = 16 * _BLOCK_WORDS
 _MAX_SELECTED = LIBRARY.constants["MAX_SELECTED"]
-_MAX_BYTES = 2**31
-
-
-def copy_all(
-    pairs: Iterable[tuple[torch.Tensor, torch.Tensor]], condition: torch.Tensor | None = None
-) -> None:
-    """Copies the second tensor of each pair into the first, as `Tensor.copy_` does, unless a
-    condition, () bool on the device, is false.
-
-    On a GPU, contiguous tensors of equal dtype and shape are copied by one kernel. Copies run in
-    any order, so a target must not share memory with another tensor of the pairs.
-    """
-    pairs = list(pairs)  # keeps sources alive until the launch
-    fused = []
-    for target, source in pairs:
-        if target.is_cuda and _is_plain_copy(target, source):
-            fused.append((target, source))
-        else:
-            if condition is not None:
-                source = torch.where(condition, source.to(target.device), target)
-            target.copy_(source)
-    for start in range(0, len(fused), _MAX_COPIES):
-        rows, n_blocks = [], 0
-        for target, source in fused[start : start + _MAX_COPIES]:
-            n_bytes = target.numel() * target.element_size()
-            is_aligned = not (target.data_ptr() | source.data_ptr()) % 16
-            fields = dict(n_bytes=n_bytes, first_block=n_blocks, is_aligned=int(is_aligned))
-            rows.append(LIBRARY.params.CopyParams(target=target, source=source, **fields))
-            n_blocks += -(-n_bytes // _BLOCK_BYTES)
-        launch(
-            *(LIBRARY, "copy_all", fused[0][0].device, Blocks(n_blocks)),
-            copies=b"".join(rows),
-            condition=condition,
-            n_copies=len(rows),
-        )
-
-
-def _is_plain_copy(target, source) -> bool:
-    return (
-        source.device == target.device
-        and source.dtype == target.dtype
-        and source.shape == target.shape
-        and source.is_contiguous()
-        and target.is_contiguous()
-        and target.numel() * target.element_size() < _MAX_BYTES
-    )
 
 
 def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[torch.Tensor]:
@@ -107,5 +61,5 @@ def select_tree(tree: Tree, lanes: torch.Tensor) -> Tree:
 
 def _can_select(tensor, n_selected) -> bool:
     n_bytes = tensor[:, :1].numel() * tensor.element_size()  # of one lane
-    is_small = 0 < n_bytes * max(n_selected, tensor.shape[1]) < _MAX_BYTES
+    is_small = 0 < n_bytes * max(n_selected, tensor.shape[1]) < MAX_BYTES
     return tensor.is_cuda and tensor.is_contiguous() and is_small

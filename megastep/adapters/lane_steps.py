@@ -2,6 +2,7 @@
 conversions. N environments, B lanes.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import cast
 
@@ -14,9 +15,10 @@ from megastep.arrdict import arrdict
 from megastep.capture import Graph, capture
 from megastep.dotdict import leaves, mapping
 from megastep.engine.resets import copies
+from megastep.kernels.build.copies import MAX_BYTES, copy_bytes
 from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 
-WORD = 4  # bytes
+WORD = 16  # bytes
 BLOCK_BYTES, BLOCK_ROWS = 2**27, 32  # at most, of copies that share memory
 
 
@@ -33,45 +35,65 @@ def fresh(tree: Tree) -> Tree:
 
 
 class Copies:
-    """Copies a tree of tensors as it is at each call. On a GPU one kernel copies all, if they fit,
-    into memory whose views are made for several calls at once, since making a view takes PyTorch as
-    long as copying. It is kept as long as any of these copies is.
+    """Copies of a tree of contiguous tensors on a GPU. One kernel, which may be a part of a CUDA
+    graph, copies all into the next row of a block. Its views are made for several rows at once,
+    since making one takes PyTorch as long as copying. They keep the whole block.
+
+    Args:
+        tree: the tensors.
+        row: (2,) int64 on the device, for the kernel: the address of the next row, and 0.
     """
 
-    def __init__(self, tree: Tree):
-        self._tree, self._leaves = tree, leaves(tree)
-        self._words = None
-        if all(map(_is_words, self._leaves)):
-            self._words = [leaf.view(-1).view(torch.int32) for leaf in self._leaves]
-        self._blank: list[tuple[torch.Tensor, ...]] = []
-
-    def __call__(self) -> Tree:
-        """Returns a copy as of now."""
-        if self._words is None:
-            return fresh(self._tree)
-        self._blank = self._blank or self._block(self._words)
-        row, *parts = self._blank.pop()
-        torch.cat(self._words, out=row)
-        rest = iter(parts)
-        return mapping(lambda _: next(rest))(self._tree)
+    def __init__(self, tree: Tree, row: torch.Tensor):
+        self._tree, self._leaves, self._row = tree, leaves(tree), row
+        ends = itertools.accumulate(-(-leaf.nbytes // WORD) * WORD for leaf in self._leaves)
+        *self._starts, self._row_bytes = 0, *ends
+        self._dtypes = [torch.empty(0, dtype=x.dtype).numpy().dtype for x in self._leaves]
+        self._blank: list[tuple[torch.Tensor, ...]] = []  # the rows that are left, with views
+        self._is_taken = True  # what the kernel wrote last
 
     @torch.inference_mode(False)  # they may be called in one, whose tensors stay in it
     @torch.no_grad()
-    def _block(self, words) -> list[tuple[torch.Tensor, ...]]:
-        """Returns memory for some copies: all words of each, and a view per leaf."""
-        sizes = [*map(len, words)]
-        n_rows = min(max(BLOCK_BYTES // (WORD * sum(sizes)), 1), BLOCK_ROWS)
-        block = words[0].new_empty(n_rows, sum(sizes))
-        parts = [
-            part.view(leaf.dtype).view(n_rows, *leaf.shape).unbind()
-            for part, leaf in zip(block.split(sizes, 1), self._leaves)
-        ]
-        return [*zip(block.unbind(), *parts)]
+    def prepare(self, n_rows: int = BLOCK_ROWS) -> None:
+        """Call it before the kernel. Makes at most ``n_rows`` rows if there is none."""
+        if not self._blank or not self._is_taken:  # a call was interrupted
+            n_rows = min(max(BLOCK_BYTES // self._row_bytes, 1), n_rows)
+            block = self._row.new_empty(n_rows, self._row_bytes, dtype=torch.uint8)
+            views = [
+                block[:, start : start + x.nbytes].view(x.dtype).view(n_rows, *x.shape).unbind()
+                for start, x in zip(self._starts, self._leaves)
+            ]
+            self._blank = [*zip(block.unbind(), *views)][::-1]
+            self._row.zero_()
+            self._row[0].fill_(block.data_ptr())
+        self._is_taken = False
 
+    def write(self) -> None:
+        """Launches the kernel."""
+        copy_bytes([*zip(self._starts, self._leaves)], row=self._row, row_bytes=self._row_bytes)
 
-def _is_words(leaf) -> bool:
-    is_aligned = leaf.nbytes % WORD == 0 and leaf.data_ptr() % WORD == 0
-    return leaf.is_cuda and leaf.is_contiguous() and leaf.itemsize <= WORD and is_aligned
+    def take(self) -> Tree:
+        """Returns what the kernel wrote last."""
+        _, *views = self._blank.pop()
+        self._is_taken = True
+        return self._as_tree(views)
+
+    def arrays(self) -> Tree:
+        """Returns what the kernel wrote last as arrays, which come together into pinned memory."""
+        row, *_ = self._blank.pop()
+        self._is_taken = True
+        on_cpu = torch.empty(len(row), dtype=torch.uint8, pin_memory=True)
+        on_cpu.copy_(row, non_blocking=True)
+        torch.cuda.current_stream(row.device).synchronize()
+        bytes = on_cpu.numpy()
+        return self._as_tree(
+            bytes[start : start + x.nbytes].view(dtype).reshape(x.shape)
+            for start, x, dtype in zip(self._starts, self._leaves, self._dtypes)
+        )
+
+    def _as_tree(self, values) -> Tree:
+        rest = iter(values)
+        return mapping(lambda _: next(rest))(self._tree)
 
 
 class Lanes:
@@ -81,9 +103,16 @@ class Lanes:
     Args:
         same_step: begin a new episode in the step that ends one, by a masked reset.
         purpose: what needs masked resets, for the message; None if nothing does.
+        parts: what of a step's result, a tree of tensors, ``copies`` has after it on a GPU.
     """
 
-    def __init__(self, env: Env, same_step: bool = False, purpose: str | None = None):
+    def __init__(
+        self,
+        env: Env,
+        same_step: bool = False,
+        purpose: str | None = None,
+        parts: Callable[[World, World, torch.Tensor], Tree] | None = None,
+    ):
         self.env, self.n_lanes, self.device = env, n_lanes(env), torch.device(env.device)
         self.roots: tuple = (env,)  # what a step changes
         self._takes_masks = takes_masks(env)
@@ -92,6 +121,8 @@ class Lanes:
         self._reset = cast(Callable, env.reset)
         self._step: Callable | None = None
         self._resets: dict[int, Callable] = {}  # by their number of arguments
+        self.copies: Copies | None = None
+        self._parts, self._row = parts, torch.empty(2, dtype=torch.int64, device=self.device)
         if purpose:
             self._require_masks(purpose)
 
@@ -166,14 +197,29 @@ class Lanes:
         the first observation where an episode ended, and the final world its last one; otherwise
         both are the same. On a GPU the same objects each time.
         """
-        if isinstance(self._step, Graph):  # which reads the decision, so inference mode may stay
-            with torch.no_grad():
-                return self._step.with_leaves(leaves(self._decision(actions)))
-        with torch.inference_mode(False), torch.no_grad():
-            decision = self._decision(actions)
-            if self._step is None and self._on_gpu:
-                self._step = capture(self._advance, (decision,), self.roots)
-            return (self._step or self._advance)(decision)
+        if not isinstance(self._step, Graph):
+            with torch.inference_mode(False), torch.no_grad():
+                decision = self._decision(actions)
+                if self._step is None and self._on_gpu:
+                    self._step = capture(self._with_copies, (decision,), self.roots)
+                if not isinstance(self._step, Graph):
+                    return (self._step or self._advance)(decision)
+        if self.copies:
+            self.copies.prepare()
+        with torch.no_grad():  # the graph reads the decision, so inference mode may stay
+            return self._step.with_leaves(leaves(self._decision(actions)))
+
+    def _with_copies(self, decision) -> tuple[World, World, torch.Tensor]:
+        stepped = self._advance(decision)
+        if self._parts:
+            parts = mapping(torch.Tensor.contiguous)(self._parts(*stepped))
+            on_gpu = all(x.is_cuda for x in leaves(parts))
+            if on_gpu and sum(x.nbytes for x in leaves(parts)) < MAX_BYTES:
+                self.copies = Copies(parts, self._row)
+                if not torch.cuda.is_current_stream_capturing():
+                    self.copies.prepare(1)
+                self.copies.write()
+        return stepped
 
     def _next_step(self, decision) -> tuple[World, World, torch.Tensor]:
         world = self.env.step(decision)

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from megastep import arrdict, envs, spaces
-from megastep.adapters.lane_steps import Copies, Lanes, ended, fresh
+from megastep.adapters.lane_steps import Lanes, ended, fresh
 from megastep.dotdict import leaves, mapping
 from megastep.plotting import rasterise
 from megastep.types import Env, Space, Tree, optional
@@ -59,7 +59,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"autoreset_mode must be one of {names}, not {autoreset_mode!r}")
         needs_masks = mode is not AutoresetMode.NEXT_STEP
         purpose = f"autoreset_mode={mode.name}" if needs_masks else None
-        self.lanes = Lanes(env, mode is AutoresetMode.SAME_STEP, purpose)
+        parts = self._copied if copy or to_numpy else None
+        self.lanes = Lanes(env, mode is AutoresetMode.SAME_STEP, purpose, parts)
         self.env, self.num_envs, self.device = env, self.lanes.n_lanes, self.lanes.device
         self.autoreset_mode, self.to_numpy, self.copy = mode, to_numpy, copy
         self.dtype = dtype or (torch.float32 if to_numpy else torch.float16)
@@ -131,27 +132,35 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             parts["final_obs"] = without_agents(self.env.obs_space, final["obs"])
         return parts
 
+    def _copied(self, world, final, over) -> dict[str, Tree]:
+        """Returns parts as they are given away; arrays of last observations when there are any."""
+        parts = self._cast(self._parts(world, final, over))
+        if self.to_numpy:
+            parts.pop("final_obs", None)
+        return parts
+
     def _cast(self, parts) -> dict[str, Tree]:
         """Returns parts with floats of observations in the dtype."""
         names = [name for name in ("obs", "final_obs") if name in parts]
         return parts | {name: as_dtype(parts[name], self.dtype) for name in names}
 
     def _tensors(self, stepped) -> dict[str, Tree]:
+        if self.lanes.copies:
+            return self.lanes.copies.take()
         if stepped is not self._stepped:  # on a GPU the same each time
             self._stepped, self._views = stepped, self._parts(*stepped)
-            self._copies = Copies(self._views)
             floats = filter(torch.is_floating_point, leaves(self._views["obs"]))
             self._casts = any(leaf.dtype != self.dtype for leaf in floats)
-        parts = self._copies() if self.copy else self._views
+        parts = fresh(self._views) if self.copy else self._views
         return self._cast(parts) if self._casts else parts
 
     def _arrays(self, stepped) -> dict[str, Tree]:
-        parts = self._cast(self._parts(*stepped))
-        last = parts.pop("final_obs", None)
-        parts = to_numpy(parts)
-        self._ended = parts["over"] if last is None else np.zeros_like(self._ended)
-        if last is not None and parts["over"].any():
-            last = to_numpy(last)
+        copies = self.lanes.copies
+        parts = copies.arrays() if copies else to_numpy(self._copied(*stepped))
+        is_same = self.autoreset_mode is AutoresetMode.SAME_STEP
+        self._ended = np.zeros_like(self._ended) if is_same else parts["over"]
+        if is_same and parts["over"].any():
+            last = to_numpy(self._cast(self._parts(*stepped))["final_obs"])
             parts["final_obs"] = np.full(self.num_envs, None, dtype=object)
             for lane in np.flatnonzero(parts["over"]):
                 parts["final_obs"][lane] = row(last, lane)

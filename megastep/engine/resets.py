@@ -8,6 +8,7 @@ from torch.utils import _pytree
 
 from megastep.engine import checks
 from megastep.engine.state_tree import is_expanded, walk
+from megastep.kernels.build.copies import copy_all
 from megastep.read_only import ReadOnlyTensor
 from megastep.types import n_lanes
 
@@ -68,16 +69,16 @@ class Resets:
         other lanes is undone. ``begin_in_place`` does it to the last world and to no other lane, or
         returns False. TypeError or ValueError name an argument that does not fit.
         """
-        everyone = torch.ones(n_lanes(env), dtype=torch.bool, device=env.device)
+        lanes = dict(size=(n_lanes(env),), dtype=torch.bool, device=env.device)
         world = self.last
         if mask is not None:
-            checks.alike("mask", mask, everyone)
+            checks.alike("mask", mask, torch.empty(**lanes))
             if world is None:
                 raise ValueError(
                     "reset(mask=...) leaves the other lanes as they are in the last world, but "
                     "there is none: call reset() first"
                 )
-        chosen = everyone if mask is None else mask.clone()
+        chosen = torch.ones(**lanes) if mask is None else mask
         if seed is not None:
             self._seed(env, seed, chosen)
         if mask is None or world is None:
@@ -86,6 +87,7 @@ class Resets:
         self.is_used = True
         if begin_in_place(chosen):
             return world
+        chosen = chosen.clone()  # it may be a part of what changes
         rows, leaves = [*self._rows(env)], _pytree.tree_leaves(world)
         before = copies([*(leaf for leaf, _ in rows), *leaves])
         new = begin(chosen)
@@ -126,11 +128,9 @@ class Resets:
 
 
 def copies(leaves: list[torch.Tensor]) -> list[torch.Tensor]:
-    """Returns copies of tensors, on a GPU by a kernel for those of each dtype."""
+    """Returns copies of tensors, on a GPU by one kernel."""
     pairs = [(torch.empty_like(leaf), leaf) for leaf in leaves]
-    for dtype in {leaf.dtype for leaf in leaves}:
-        copies, some = zip(*(pair for pair in pairs if pair[1].dtype == dtype))
-        torch._foreach_copy_(copies, some)  # pyright: ignore[reportPrivateImportUsage]
+    copy_all(pairs)
     return [copy for copy, _ in pairs]
 
 

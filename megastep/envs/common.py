@@ -67,7 +67,7 @@ def judged(
         library=library,
         ages=env.ages,
         ended=env.ended,
-        only_ended=int(resets.mask is not None),
+        only=resets.mask,
         **outputs,
         **fields,
     )

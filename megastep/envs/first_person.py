@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from pydantic import Field
+from torch.utils._pytree import tree_leaves
 
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
@@ -143,7 +144,8 @@ class FirstPerson(SceneryEnv):
         return modules.RandomSpawns(geometries, self.core, resample=resample)
 
     def _begin(self, mask) -> arrdict:
-        self.ended.copy_(mask)
+        if self._resets.mask is None:  # otherwise `_begins` is the mask
+            self.ended.copy_(mask)
         return self._world()
 
     def _begin_in_place(self, mask) -> bool:
@@ -153,14 +155,20 @@ class FirstPerson(SceneryEnv):
             return False
         if self._resets.parts.get("world") is not self._resets.last:
             return False  # the last world may come from elsewhere, such as a checkpoint
-        ended = self.ended.clone()
+        mask, changed = mask.contiguous(), (self.ended, *tree_leaves(self._resets.last))
+        if any(mask.data_ptr() == leaf.data_ptr() for leaf in changed):
+            mask = mask.clone()
         self._resets.mask = mask
         try:
             self._begin(mask)
         finally:
             self._resets.mask = None
-        self.ended.copy_(torch.where(mask, self.ended, ended))
         return True
+
+    @property
+    def _begins(self) -> torch.Tensor:
+        """(B,) bool: lanes whose episode begins in this step, or in a reset in place."""
+        return self.ended if self._resets.mask is None else self._resets.mask
 
     def desync(self) -> None:
         """Gives every lane a random age, from the seed, so that episodes do not end together."""

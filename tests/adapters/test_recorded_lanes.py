@@ -4,10 +4,13 @@ graphs are of PyTorch operations on a CPU; test_adapters.py has real ones.
 
 import pytest
 import torch
+from torch.utils._pytree import tree_leaves
 
-from megastep import capture, contract, engine, spaces
+from megastep import adapters, capture, contract, engine, spaces
+from megastep.adapters import lane_steps
 from megastep.adapters.lane_steps import Lanes
 from megastep.arrdict import arrdict
+from megastep.kernels.build import copies
 from tests.helpers import graphs_on_cpu
 
 N = 5
@@ -84,3 +87,38 @@ def test_any_order_of_calls_shows_what_plain_lanes_do(same_step, monkeypatch):
         assert all(contract.same({"": one}, {"": other}) for one, other in pairs)
     recordings = [graphs._step, *graphs._resets.values()]  # a reset with seeds and one without
     assert len(recordings) == 3 and all(isinstance(one, capture.Graph) for one in recordings)
+
+
+@pytest.mark.parametrize("same_step", (False, True))
+def test_copies_of_a_graph_stay_as_they_were(same_step, monkeypatch, cuda_on_cpu):
+    """In blocks of three rows, and after a step that was interrupted behind the graph."""
+    graphs_on_cpu.install(monkeypatch)
+    monkeypatch.setattr(lane_steps, "BLOCK_ROWS", 3)
+
+    def launch(*args, **fields):
+        if graphs_on_cpu.GraphOnCpu.is_recording:
+            graphs_on_cpu.GraphOnCpu.recorded.append((cuda_on_cpu, args, fields, None))
+        else:
+            cuda_on_cpu(*args, **fields)
+
+    monkeypatch.setattr(copies, "launch", launch)
+    mode = "same_step" if same_step else "next_step"
+    plain, graphs = (adapters.VectorEnv(Sums(), mode, to_numpy=False) for _ in range(2))
+    for name, leaf in vars(graphs.env).items():
+        if isinstance(leaf, torch.Tensor):
+            setattr(graphs.env, name, cuda_on_cpu.tensor(leaf))
+    graphs.lanes._on_gpu, kept = True, []
+    plain.reset(seed=3)
+    graphs.reset(seed=3)
+    for i in range(20):
+        actions = torch.arange(N) % 3
+        expected = plain.step(actions)
+        shown = graphs.step(actions)
+        assert graphs.lanes.copies and isinstance(graphs.lanes._step, capture.Graph)
+        kept.append((expected, shown))
+        if i == 10:
+            plain.step(actions)
+            graphs.lanes.step(actions)
+    for expected, shown in kept:
+        pairs = zip(*map(tree_leaves, (expected, shown)), strict=True)
+        assert all(torch.equal(one, other) for one, other in pairs)

@@ -31,6 +31,7 @@ class GraphOnCpu:
     """Stands in for `torch.cuda.CUDAGraph`."""
 
     is_recording = False
+    recorded: list = []  # of the graph that is recorded last
 
     def __init__(self):
         self.operations = []
@@ -60,7 +61,7 @@ def _address(tensor):
 
 @contextlib.contextmanager
 def _record(graph, stream=None, capture_error_mode="global"):
-    GraphOnCpu.is_recording = True
+    GraphOnCpu.is_recording, GraphOnCpu.recorded = True, graph.operations
     try:
         with _Recorder(graph.operations):
             yield
@@ -88,6 +89,7 @@ def install(monkeypatch, may_wait=False):
         stream=contextlib.nullcontext,
         device=contextlib.nullcontext,
         graph=_record,
+        is_current_stream_capturing=lambda: GraphOnCpu.is_recording,
     ).items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(capture, "end_failed_recording", lambda: None)

@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from megastep import cache
-from megastep.agents.storage.copies import LIBRARY as COPIES
 from megastep.kernels.build import compile, kernel_library, launch
+from megastep.kernels.build.copies import LIBRARY as COPIES
 from megastep.kernels.build.launch import ENGINE
 
 GPU = torch.device("cuda", 0)
@@ -201,7 +201,7 @@ def test_without_early_starts_no_kernel_starts_early(monkeypatch):
 
     def copy():
         operation = COPIES, "copy_all", torch.device("cuda", 1), 100
-        launch.launch(*operation, copies=b"", condition=None, n_copies=0)
+        launch.launch(*operation, copies=b"", condition=None, n_copies=0, row=None, row_bytes=0)
 
     copy()
     with launch.without_early_starts():

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from megastep.agents.storage import copies
-from megastep.agents.storage.copies import copy_all, select_lanes, select_tree
+from megastep.agents.storage.copies import _MAX_SELECTED, copy_all, select_lanes, select_tree
 from megastep.arrdict import arrdict
+from megastep.kernels.build import copies
 
 DTYPES = torch.bool, torch.uint8, torch.int32, torch.int64, torch.float16, torch.float32
 SIZES = 0, 1, 3, 16, 1000, 70_001  # the last takes several blocks
@@ -132,7 +132,7 @@ def test_selects_lanes_in_every_step(device, n_selected):
         for n_steps, *rest in shapes
         for i, dtype in enumerate(DTYPES)
     ]
-    assert len(tensors) > 2 * copies._MAX_SELECTED
+    assert len(tensors) > 2 * _MAX_SELECTED
     selected = select_lanes(tensors, lanes)
     for i, (tensor, ours) in enumerate(zip(tensors, selected, strict=True)):
         assert torch.equal(ours, tensor[:, lanes]), i

@@ -1,27 +1,11 @@
 // The parameters of each launch, passed by value; see megastep/kernels/params.h.
 #pragma once
 
-constexpr int MAX_COPIES = 24;    // of a launch
 constexpr int MAX_SELECTED = 16;  // tensors that lanes are selected from, of a launch
-constexpr int COPY_WORDS = 4;     // words of 16 bytes that a thread copies
 constexpr int MAX_LEVELS = 8;     // of a sum tree
 constexpr int SET_THREADS = 512;  // of the block that changes priorities
 constexpr int MAX_SET = 8192;     // priorities that one block changes sooner than many kernels do
 constexpr int READ_THREADS = 256;
-
-struct CopyParams {
-    void* target;
-    const void* source;
-    unsigned int n_bytes;      // less than 2^31
-    unsigned int first_block;  // of the launch that copies it
-    int is_aligned;            // both begin at a multiple of 16 bytes
-};
-
-struct CopyAllParams {
-    CopyParams copies[MAX_COPIES];
-    const unsigned char* condition;  // (), false: nothing changes; null: true
-    int n_copies;
-};
 
 struct SelectParams {
     void* target;        // (T, M, words)

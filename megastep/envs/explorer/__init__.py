@@ -141,8 +141,8 @@ class Explorer(FirstPerson):
         self.ages.copy_(random_ages(self.limits, self.core.seed))
 
     def _world(self, free=None) -> arrdict:
-        self.spawner(self.ended)
-        view = self._view(seen=self.seen, clear_mask=self.ended[:, None])
+        self.spawner(self._begins)
+        view = self._view(seen=self.seen, clear_mask=self._begins[:, None])
         out = self._judge(view.newly_seen)
         return world_of(out, images(view), ["coverage"], episode="episode", unseen="unseen")
 

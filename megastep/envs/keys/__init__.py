@@ -113,7 +113,7 @@ class Keys(FirstPerson):
         return super()._begin(mask)
 
     def _world(self, free=None) -> arrdict:
-        self.spawner(self.ended)
+        self.spawner(self._begins)
         out = self._judge()
         obs = arrdict(images(self._view()), keys=out["keys_obs"])
         return world_of(out, obs, METRICS, places="privileged")

@@ -147,7 +147,7 @@ class Memory(FirstPerson):
         return super()._furnish(geometries, resample)
 
     def _world(self, free=None) -> arrdict:
-        self.spawner(self.ended)
+        self.spawner(self._begins)
         out = self._judge()
         obs = arrdict(images(self._view()), cue=out["cue_obs"])
         return world_of(out, obs, ["found"], goal="goal", places="places")

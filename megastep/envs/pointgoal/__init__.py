@@ -124,7 +124,7 @@ class PointGoal(FirstPerson):
         return modules.RandomSpawns(geometries, self.core, resample=resample, points=points)
 
     def _world(self, free=None) -> arrdict:
-        self.spawner(self.ended)
+        self.spawner(self._begins)
         out = self._judge(free)
         obs = arrdict(self._sensed(), goal=out["goal_obs"])
         return world_of(out, obs, METRICS, way="privileged")

@@ -4,6 +4,7 @@
 
 constexpr int BLOCK = 64;      // threads per block, in every launch
 constexpr int WARP = 32;       // threads per warp
+constexpr int COPY_WORDS = 4;  // words of 16 bytes that a thread copies
 constexpr int BOX_WALLS = 32;  // walls of a layout that share a bounding box, one per warp lane
 
 // Errors that only the device can see. A flag holds ERROR_KINDS * index + kind; 0 means no error.

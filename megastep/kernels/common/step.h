@@ -20,7 +20,7 @@ struct GameParams : OutcomeParams {
     int* ages;             // (N, A) in and out: steps since the first observation
     unsigned char* ended;  // (N, A) in: starts an episode in this step; out: ends it in this step
     int* error_flag;       // (1) out: see common/errors.h
-    int only_ended;        // 1: only lanes that `ended` take part
+    const unsigned char* only;  // (B) null, or the only lanes that take part, which all start one
 };
 
 // Of such a game that draws random numbers.
@@ -42,7 +42,10 @@ struct BoardParams : OutcomeParams {
     int n_threads;  // CPU threads
 };
 
-HD int takes_part(const GameParams& p, int i) { return !p.only_ended || p.ended[i]; }
+HD int takes_part(const GameParams& p, int i) { return !p.only || p.only[i]; }
+
+// Whether lane i, which takes part, starts an episode.
+HD int begins(const GameParams& p, int i) { return p.only || p.ended[i]; }
 
 // Writes how lane i's step ends: the episode, if it `ends`, by the game's rule or by time.
 HD void write_outcome(const OutcomeParams& p, int i, float reward, int reset, int ends, int rule) {

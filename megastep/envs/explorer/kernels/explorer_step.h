@@ -85,7 +85,7 @@ struct Episode {
 };
 
 HD Episode read_episode(const ExplorerStepParams& p, int agent) {
-    return {p.ended[agent], p.newly_seen[agent], p.ages[agent], p.limits[agent]};
+    return {begins(p, agent), p.newly_seen[agent], p.ages[agent], p.limits[agent]};
 }
 
 // The episode one step later. Each texel that is seen for the first time is worth another step.

@@ -97,7 +97,7 @@ HD void write_privileged(const KeysStepParams& p, int env, int age) {
 HD void keys_env(const KeysStepParams& p, int env) {
     if (!takes_part(p, env))
         return;
-    int reset = p.ended[env], n = p.n_colours, success = 0;
+    int reset = begins(p, env), n = p.n_colours, success = 0;
     Object* things = objects_of(p.objects, env);
     if (reset)
         start_episode(p, env, layout_of(p.scenery, env, p.error_flag));

@@ -86,7 +86,7 @@ HD void write_privileged(const MemoryStepParams& p, int env, int cue, int age) {
 HD void memory_env(const MemoryStepParams& p, int env) {
     if (!takes_part(p, env))
         return;
-    int reset = p.ended[env], cue = p.cue[env], hit = 0;
+    int reset = begins(p, env), cue = p.cue[env], hit = 0;
     flag_nonfinite(p.error_flag, env, p.positions[2 * env], p.positions[2 * env + 1],
                    p.angles[env]);
     if (!reset) {

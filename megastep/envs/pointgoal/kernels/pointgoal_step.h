@@ -123,7 +123,7 @@ HD void pointgoal_agent(const PointgoalStepParams& p, int agent) {
         return;
     const SceneryParams& s = p.scenery;
     int env = agent / s.n_agents, layout = layout_of(s, env, p.error_flag);
-    int n = s.n_envs * s.n_agents, reset = p.ended[agent];
+    int n = s.n_envs * s.n_agents, reset = begins(p, agent);
     long long rows = n;
     float* progress = p.progress + agent;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1];
