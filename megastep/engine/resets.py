@@ -69,16 +69,16 @@ class Resets:
         other lanes is undone. ``begin_in_place`` does it to the last world and to no other lane, or
         returns False. TypeError or ValueError name an argument that does not fit.
         """
-        lanes = dict(size=(n_lanes(env),), dtype=torch.bool, device=env.device)
+        everyone = torch.empty(n_lanes(env), dtype=torch.bool, device=env.device)
         world = self.last
         if mask is not None:
-            checks.alike("mask", mask, torch.empty(**lanes))
+            checks.alike("mask", mask, everyone)
             if world is None:
                 raise ValueError(
                     "reset(mask=...) leaves the other lanes as they are in the last world, but "
                     "there is none: call reset() first"
                 )
-        chosen = torch.ones(**lanes) if mask is None else mask
+        chosen = everyone.fill_(True) if mask is None else mask
         if seed is not None:
             self._seed(env, seed, chosen)
         if mask is None or world is None:
