@@ -471,6 +471,18 @@ def test_tensors_are_those_of_the_cpu_and_do_not_synchronise(mode):
             assert torch.equal(given[key].cpu(), expected[key])
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("mode", (NEXT, SAME))
+def test_arrays_are_those_of_the_cpu(mode):
+    vectors = [adapters.VectorEnv(pointgoal(device=device), mode) for device in ("cpu", "cuda")]
+    for vector in vectors:
+        vector.reset(seed=3)
+        vector.env.desync()
+    actions = [action[:, 0].numpy() for action in moves(vectors[0].env, 40)]
+    steps = [[vector.step(action) for action in actions] for vector in vectors]
+    np.testing.assert_equal(*steps)
+
+
 # ---- Training ----
 
 

@@ -263,9 +263,15 @@ def test_lanes_that_begin_in_place_begin_as_elsewhere(name, on_gpu, request, mon
         worlds = [env.step(decision).clone() for env in (own, other)]
         assert contract.same(*worlds)
         mask = worlds[0].terminal | worlds[0].truncated | (torch.arange(N) == 3)
+        mask = torch.stack([mask, ~mask], 1)[:, 0]  # not contiguous
         address = own._resets.last.obs.rgb.data_ptr()
         worlds = [env.reset(mask=mask) for env in (own, other)]
         assert contract.same(*worlds) and worlds[0].obs.rgb.data_ptr() == address
+        worlds = [
+            env.reset(mask=world.truncated.logical_not_())
+            for env, world in zip((own, other), worlds)
+        ]
+        assert contract.same(*worlds)
         states = [state_tree(env) for env in (own, other)]
         assert all(is_same(leaf, states[1][path]) for path, leaf in states[0].items())
     nobody = torch.zeros(N, dtype=torch.bool)
