@@ -35,13 +35,9 @@ def fresh(tree: Tree) -> Tree:
 
 
 class Copies:
-    """Copies of a tree of contiguous tensors on a GPU. One kernel, which may be a part of a CUDA
-    graph, copies all into the next row of a block. Its views are made for several rows at once,
-    since making one takes PyTorch as long as copying. They keep the whole block.
-
-    Args:
-        tree: the tensors.
-        row: (2,) int64 on the device, for the kernel: the address of the next row, and 0.
+    """Copies of a tree of contiguous tensors on a GPU. A kernel, which may be part of a CUDA graph,
+    copies all into the next row of a block, whose address and a 0 are in ``row``, (2,) int64. Views
+    are made for a whole block, which they keep, since each takes PyTorch as long as copying.
     """
 
     def __init__(self, tree: Tree, row: torch.Tensor):
@@ -72,27 +68,19 @@ class Copies:
         """Launches the kernel."""
         copy_bytes([*zip(self._starts, self._leaves)], row=self._row, row_bytes=self._row_bytes)
 
-    def take(self) -> Tree:
-        """Returns what the kernel wrote last."""
-        _, *views = self._blank.pop()
+    def take(self, to_numpy: bool = False) -> Tree:
+        """Returns what the kernel wrote last; as arrays, it comes into pinned memory at once."""
+        row, *views = self._blank.pop()
         self._is_taken = True
-        return self._as_tree(views)
-
-    def arrays(self) -> Tree:
-        """Returns what the kernel wrote last as arrays, which come together into pinned memory."""
-        row, *_ = self._blank.pop()
-        self._is_taken = True
-        on_cpu = torch.empty(len(row), dtype=torch.uint8, pin_memory=True)
-        on_cpu.copy_(row, non_blocking=True)
-        torch.cuda.current_stream(row.device).synchronize()
-        bytes = on_cpu.numpy()
-        return self._as_tree(
-            bytes[start : start + x.nbytes].view(dtype).reshape(x.shape)
-            for start, x, dtype in zip(self._starts, self._leaves, self._dtypes)
-        )
-
-    def _as_tree(self, values) -> Tree:
-        rest = iter(values)
+        if to_numpy:
+            on_cpu = torch.empty(len(row), dtype=torch.uint8, pin_memory=True)
+            on_cpu.copy_(row, non_blocking=True)
+            torch.cuda.current_stream(row.device).synchronize()
+            views = [
+                on_cpu.numpy()[start : start + x.nbytes].view(dtype).reshape(x.shape)
+                for start, x, dtype in zip(self._starts, self._leaves, self._dtypes)
+            ]
+        rest = iter(views)
         return mapping(lambda _: next(rest))(self._tree)
 
 

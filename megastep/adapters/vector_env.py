@@ -156,7 +156,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def _arrays(self, stepped) -> dict[str, Tree]:
         copies = self.lanes.copies
-        parts = copies.arrays() if copies else to_numpy(self._copied(*stepped))
+        parts = copies.take(to_numpy=True) if copies else to_numpy(self._copied(*stepped))
         is_same = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._ended = np.zeros_like(self._ended) if is_same else parts["over"]
         if is_same and parts["over"].any():
