@@ -192,7 +192,7 @@ def _kernel(scenery, res, subsample) -> str:
     n_threads = WARP * scenery.n_envs * scenery.n_agents
     room = n_resident_threads(scenery.device)
     # two warps per agent, if agents are few, share whole tiles of the screen: of whole pixels
-    if 2 * n_threads <= room and res > WARP and WARP % subsample == 0:
+    if 3 * n_threads <= room and res > WARP and WARP % subsample == 0:
         return "render_split"
     # with more registers for each warp, until agents are many
     return "render_unspilled" if n_threads <= UNSPILLED_WAVES * room else "render"

@@ -78,7 +78,7 @@ SETTINGS = [
 
 #: Threads per environment that a GPU runs at once, by what that makes 24 environments: each number
 #: has another kernel, or other threads per environment.
-ROOMS = dict(many=0, some=32, few=64)
+ROOMS = dict(many=0, some=32, few=96)
 amounts = pytest.mark.parametrize("amount", ROOMS)
 
 
@@ -130,12 +130,12 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu,
 @pytest.mark.parametrize(
     "n_envs, n_agents, res, subsample, kernel",
     [
-        (4224, 1, 256, 4, "render_split"),
-        (4225, 1, 256, 4, "render_unspilled"),
+        (2816, 1, 256, 4, "render_split"),
+        (2817, 1, 256, 4, "render_unspilled"),
         (33_792, 1, 256, 4, "render_unspilled"),
         (33_793, 1, 256, 4, "render"),
-        (2112, 2, 256, 4, "render_split"),
-        (2113, 2, 256, 4, "render_unspilled"),
+        (1408, 2, 256, 4, "render_split"),
+        (1409, 2, 256, 4, "render_unspilled"),
         (64, 1, 32, 1, "render_unspilled"),  # a single tile
         (64, 1, 96, 3, "render_unspilled"),  # tiles would cut pixels
         (64, 2, 96, 3, "render_unspilled"),
