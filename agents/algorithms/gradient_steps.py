@@ -22,7 +22,7 @@ from megastep.agents.distributed import pooling
 from megastep.agents.distributed.pooling import Moments, pool_with_condition
 from megastep.agents.networks.fused import fused, is_plain_on_gpu
 from megastep.agents.types import StateDict
-from megastep.kernels.build.launch import Blocks, launch
+from megastep.kernels.build.launch import Blocks, launch, without_early_starts
 
 #: Bounds of a step size that follows the KL divergence, those of rsl_rl.
 ADAPTIVE_LR = 1e-5, 1e-2
@@ -73,10 +73,11 @@ def _average_on_gpu(parameters, n_valid, means=()) -> tuple[torch.Tensor, list[t
         )
     pooling.all_reduce(bucket)
     n, n_pooled = sum(sizes), torch.empty_like(n_valid)
-    launch(
-        *(LIBRARY, "divide", device, Blocks(-(-n // (4 * THREADS)), threads=THREADS)),
-        **dict(bucket=bucket, total=total, n_valid=n_pooled, n=n),
-    )
+    with without_early_starts():  # a kernel of NCCL comes before
+        launch(
+            *(LIBRARY, "divide", device, Blocks(-(-n // (4 * THREADS)), threads=THREADS)),
+            **dict(bucket=bucket, total=total, n_valid=n_pooled, n=n),
+        )
     for p, average in zip(held, averages):
         p.grad = average
     return n_pooled, averages[len(held) :]

@@ -210,7 +210,7 @@ def _update_on_gpu(adam, is_taken, grad_norm, max_norm) -> None:
 
 
 def _launches(adam) -> Iterator[tuple[list[bytes], int]]:
-    names = "parameter", "gradient", "mean", "square"
+    names = "parameter gradient mean square".split()
     rows = (
         (dict(zip(names, tensors)), dict(lr_factor=factor, weight_decay=weight_decay))
         for factor, weight_decay, members in adam.rows()

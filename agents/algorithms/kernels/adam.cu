@@ -51,8 +51,8 @@ KERNEL __launch_bounds__(256) pack(PackParams p) {
         *p.total = n_valid;
 }
 
-// Follows NCCL's kernel, and does not start early.
 KERNEL __launch_bounds__(256) divide(DivideParams p) {
+    wait_for_previous();
     int at = 4 * (blockIdx.x * ADAM_THREADS + threadIdx.x);
     float values[4], total = *p.total;
     if (!at)
