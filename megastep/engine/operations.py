@@ -30,6 +30,7 @@ GROUPS = (32, 16, 8)
 #: Blocks that a multiprocessor holds, by the bounds of `physics_unspilled`.
 UNSPILLED_BLOCKS = 18
 APART = 0.05  # metres
+MAX_SPAWN_WARPS = 1 << 15  # that look whether agents respawn where there are objects
 #: Of baked light in the cache: the beginning of files' names, their number, and the fewest layouts.
 PREFIX, MAX_FILES, MIN_CACHED = "baked-light-", 16, 32
 MAX_SLOTS = ENGINE.constants["MAX_SLOTS"]  # agents and movable objects of an environment
@@ -192,8 +193,10 @@ def spawn(
     int32 = torch.int32, device
     kernel = "spawn_hidden" if checks.flag("hidden", hidden) else "spawn"
     kernel += "" if scenery.objects is None else "_objects"
+    per_warp = -(-scenery.n_envs // MAX_SPAWN_WARPS) if kernel == "spawn_objects" else 1
+    n_threads = scenery.n_envs if kernel == "spawn" else -(-scenery.n_envs // per_warp) * WARP
     launch_in(
-        *(scenery, agents, kernel, scenery.n_envs * (1 if kernel == "spawn" else WARP), *MOTION),
+        *(scenery, agents, kernel, n_threads, *MOTION),
         mask=checks.address("mask", mask, lanes, torch.bool, device),
         points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, device),
         counts=checks.address("counts", counts, lanes, *int32),
@@ -202,6 +205,7 @@ def spawn(
         **seed_params(seed),
         n_points=n_points,
         resample=int(checks.flag("resample", resample)),
+        per_warp=per_warp,
         objects=object_params(scenery),
     )
 

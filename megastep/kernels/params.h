@@ -97,6 +97,7 @@ struct SpawnParams : DrawParams {
     int* point_index;       // (N, A) out where mask: the layout's point
     const int* cumulative;  // (D) cumulative weights of the layouts; null: all are as likely
     int resample;           // 1: an environment moves to a random layout if all its agents respawn
+    int per_warp;           // environments for which a warp of `spawn_objects` looks
 };
 
 struct UpdateObjectsParams : WorldParams {

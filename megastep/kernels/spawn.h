@@ -125,13 +125,21 @@ HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
         s.layout[env] = layout;
 }
 
+// The same of neighbouring environments: many have too many warps, most with nothing to do.
+template <class Group>
+HD void spawn_neighbours(const SpawnParams& p, const Group& group, int number) {
+    int first = number * p.per_warp, end = mini(first + p.per_warp, p.scenery.n_envs);
+    for (int env = first; env < end; env++)
+        spawn_env<0, 1>(p, group, env);
+}
+
 // Agents, few of which respawn: a GPU has a thread per environment. Where points are to be hidden
 // it has a warp, each thread of which tests one wall at a time; so it has where there are objects,
 // of which each thread drops some.
 EACH(spawn, SpawnParams, p.scenery.n_envs, threads_for_agents(p.scenery, 1 << 14),
      spawn_env<0, 0>(p, SingleThread{0}, i))
-EACH_WARP(spawn_objects, SpawnParams, p.scenery.n_envs, threads_for_agents(p.scenery, 1 << 14),
-          spawn_env<0, 1>(p, group, i))
+EACH_WARP(spawn_objects, SpawnParams, (p.scenery.n_envs + p.per_warp - 1) / p.per_warp,
+          threads_for_agents(p.scenery, 1 << 14), spawn_neighbours(p, group, i))
 EACH_WARP(spawn_hidden, SpawnParams, p.scenery.n_envs, p.scenery.n_threads,
           spawn_env<1, 0>(p, group, i))
 EACH_WARP(spawn_hidden_objects, SpawnParams, p.scenery.n_envs, p.scenery.n_threads,
