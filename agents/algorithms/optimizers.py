@@ -210,7 +210,7 @@ def _update_on_gpu(adam, is_taken, grad_norm, max_norm) -> None:
 
 
 def _launches(adam) -> Iterator[tuple[list[bytes], int]]:
-    names = "parameter gradient mean square".split()
+    names = "parameter", "gradient", "mean", "square"
     rows = (
         (dict(zip(names, tensors)), dict(lr_factor=factor, weight_decay=weight_decay))
         for factor, weight_decay, members in adam.rows()
@@ -220,7 +220,7 @@ def _launches(adam) -> Iterator[tuple[list[bytes], int]]:
 
 
 def launches(
-    pack_row: Callable[..., bytes], rows: Iterable[tuple[dict[str, torch.Tensor], dict]]
+    pack_row: Callable[..., bytes], rows: Iterable[tuple[dict, dict]]
 ) -> Iterator[tuple[list[bytes], int]]:
     """Yields the packed rows of a launch and its number of blocks. A row is its tensors, of equally
     many numbers, and its other fields.
