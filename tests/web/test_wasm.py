@@ -127,14 +127,17 @@ def digest(replay, hashed):
     return state.hexdigest()[:16]
 
 
+AGENTS = "deathmatch_anywhere", "explorer_anywhere", "pointgoal_anywhere", "hideandseek_quadrant"
+
+
 @torch.no_grad()
-@pytest.mark.parametrize("name", tiers("deathmatch", "explorer", "pointgoal"))
+@pytest.mark.parametrize("name", tiers(*AGENTS))
 def test_packaged_agents_act_as_in_pytorch_for_400_steps(name, tmp_path):
     """Greedily, in a closed loop: both in WebAssembly, against both in Python."""
     settings = dict(n_envs=1, seed=3, resample=True)
-    policy = pretrained.load(f"{name}_anywhere", "cpu")
-    homes = geometries.sample("homes", 3, "test", seed=7)
-    envs = [env_of(f"{name}_anywhere", homes, **settings) for _ in "ab"]
+    policy = pretrained.load(name, "cpu")
+    homes = geometries.sample("quadrant" if "hide" in name else "homes", 3, "test", seed=7)
+    envs = [env_of(name, homes, **settings) for _ in "ab"]
     program = record(envs[0])
     acting = add_policy(program, policy, range(n_lanes(envs[0])))
     about = ABOUT | {"policies": [acting._asdict()]}
