@@ -76,8 +76,9 @@ class BC(learner.GradientLearner):
         for name in {**own, **stored}:
             if own.get(name) != stored.get(name):
                 raise ValueError(
-                    f"{self.dataset.folder} has {name} of {stored.get(name)}, and the environment "
-                    f"has {own.get(name)}: use the settings of env that it was dumped with"
+                    f"{name} is {stored.get(name, 'missing')} in {self.dataset.folder}, and "
+                    f"{own.get(name, 'missing')} in the environment: use the settings of env that "
+                    "it was dumped with"
                 )
         env.reset()
         self.policy.clear_stats()

@@ -203,8 +203,7 @@ class Waves:
             policy: PolicyLike = restore.policy_of(self.loaded, env)
             restore.load_wrappers(env, self.loaded)
         else:
-            name = None if self.cfg.bot == "bot" else self.cfg.bot
-            policy = factory.make_bot(name, self.settings, self.sample)
+            policy = factory.make_bot(self.cfg.bot, self.settings, self.sample)
             policy = factory.in_env(policy, self.settings, env)
         self.told, self.actor = _Told(env, self.cfg.truth), _Actor(policy, self.cfg.greedy)
         state = self.actor.initial(self.n_lanes, env.device)

@@ -224,10 +224,6 @@ def find_player(
     environment's own. UserError if this player cannot play there.
     """
     if is_bot(name):
-        return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
-    try:
-        path = folders.find(name)
-    except UserError as error:
-        bots = "" if os.path.exists(name) else f" (bots are bot, {', '.join(BOTS)})"
-        raise UserError(f"{error}{bots}") from None
+        return Player(name, factory.make_bot(name, env_settings, env))
+    path = factory.find_or_name_bots(name)
     return load_player(folders.load_checkpoint(path, trust, env.device), env, run)

@@ -3,7 +3,9 @@
 import copy
 import functools
 import inspect
+import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -223,13 +225,12 @@ def make_opponents(
 
 def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
     """Returns a policy that does not learn, which takes one step in `env`; UserError if it cannot
-    play. `name`: one of `BOTS`, an import path, a run, whose agent it is, or None: `env.bot`.
+    play. `name`: one of `BOTS`, an import path, a run, whose agent it is, or "bot": `env.bot`.
     """
-    where = type(env).__name__
+    where, name = type(env).__name__, None if name == "bot" else name
     if name and name not in BOTS and ":" not in name:
-        return restore.policy_of(
-            folders.load_checkpoint(folders.find(name), False, env.device), env
-        )
+        path = find_or_name_bots(name)
+        return restore.policy_of(folders.load_checkpoint(path, False, env.device), env)
     with errors():
         constructor = import_object(BOTS.get(name, name)) if name else optional(env, "bot")
     if constructor is None:
@@ -249,6 +250,15 @@ def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
         decision, _ = bot(env.reset(), bot.initial(n_lanes(env), env.device))
         spaces.map(check_actions, env.action_space, decision["actions"])
     return bot
+
+
+def find_or_name_bots(name: str) -> Path:
+    """Returns the path of who is no bot, see `folders.find`. UserError names the bots."""
+    try:
+        return folders.find(name)
+    except UserError as error:
+        bots = "" if os.path.exists(name) else f" (bots are bot, {', '.join(BOTS)})"
+        raise UserError(f"{error}{bots}") from None
 
 
 def in_env(bot: PolicyLike, settings: Env, env: types.Env) -> PolicyLike:

@@ -100,6 +100,11 @@ class Run:
                 folders.record_start(self.folder)
                 where = f"{self.n_ranks} x {self.device.type}" if self.n_ranks > 1 else self.device
                 console.say(f"{self.title} on {where} in {self.folder}")
+                chosen = self.cfg.opponents
+                if chosen.bot_class and not chosen.bot:
+                    console.warn("opponents.bot_class plays in no environment, as opponents.bot=0")
+                if chosen.role and not (chosen.past or chosen.bot or chosen.league):
+                    console.warn("opponents.role has no effect without opponents.past= or bot=")
             undo.pop_all()
 
     def open(self, locks: contextlib.ExitStack) -> tuple[Path, Any]:

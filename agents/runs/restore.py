@@ -39,7 +39,9 @@ def load_weights(policy: Policy, loaded: "Checkpoint", env: Env | None = None) -
     """Returns a policy with a checkpoint's weights. UserError if weights or spaces do not fit."""
     saved, present = loaded.config["spaces"], {} if env is None else spaces.texts(env)
     if present and (names := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]):
-        changes = [f"{name} was {saved.get(name)} and is {present.get(name)}" for name in names]
+        changes = [
+            f"{k} was {saved.get(k, 'missing')} and is {present.get(k, 'missing')}" for k in names
+        ]
         ids = loaded.config["train"]["env"].get("id"), getattr(env, "id", None)
         of_ids = f", {ids[0]} and not {ids[1]}" if ids[0] != ids[1] else ""
         raise UserError(

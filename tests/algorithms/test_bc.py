@@ -120,8 +120,8 @@ def test_a_resumed_run_is_the_same(folder, tmp_path):
     ("words", "sentence"),
     {
         ("learner.data={absent}",): "does not exist; give a folder that megastep dump has written",
-        ("env.control=continuous",): "has actions of MultiDiscrete(n_agents=1, n_actions=7), and",
-        ("env.res=32",): "has obs.rgb of MultiImage(n_agents=1, C=3, H=1, W=16), and the environ",
+        ("env.control=continuous",): "actions is MultiDiscrete(n_agents=1, n_actions=7) in ",
+        ("env.res=32",): "obs.rgb is MultiImage(n_agents=1, C=3, H=1, W=16) in ",
         ("agent.critic=asymmetric",): "use agent.critic=plain",
         ("learner.data=null",): "learner.data: ",
     }.items(),

@@ -59,7 +59,7 @@ def test_metrics_by_kind_of_opponent(here):
     assert "bot, as right" in path.read_text(), "the environment's own"
 
 
-def test_one_role_learns_against_the_agent_of_a_run(here):
+def test_one_role_learns_against_the_agent_of_a_run(here, capsys):
     first = train.run(configured(f"samples={UPDATE}", tiny=PONG))
     words = ["opponents.past=0", "opponents.bot=1", "opponents.role=right"]
     words += [f"opponents.bot_class={first}", f"samples={6 * OPPOSED_UPDATE}"]
@@ -67,6 +67,11 @@ def test_one_role_learns_against_the_agent_of_a_run(here):
     last = json_lines.read(folder / "metrics.jsonl")[-1]
     assert "episode/return/right" in last and "episode/return/left" not in last
     assert train.main([*OPPOSED, "samples=100", "opponents.bot_class=runs/none"]) == 2
+    assert "(bots are bot, explorer, hunter, " in capsys.readouterr().err
+    words = "opponents.role=right", f"opponents.bot_class={first}", "env.self_play=true"
+    train.run(configured(*words, f"samples={UPDATE}", tiny=PONG))
+    text = capsys.readouterr().err
+    assert "bot_class plays in no environment" in text and "role has no effect without" in text
 
 
 class Configured(Always):
