@@ -52,7 +52,8 @@ class Copies:
     @torch.no_grad()
     def prepare(self, n_rows: int = BLOCK_ROWS) -> None:
         """Call it before the kernel. Makes at most ``n_rows`` rows if there is none."""
-        if not self._blank or not self._is_taken:  # a call was interrupted
+        is_ready, self._is_taken = self._blank and self._is_taken, False
+        if not is_ready:  # none is left, or a call was interrupted
             n_rows = min(max(BLOCK_BYTES // self._row_bytes, 1), n_rows)
             block = self._row.new_empty(n_rows, self._row_bytes, dtype=torch.uint8)
             views = [
@@ -62,7 +63,6 @@ class Copies:
             self._blank = [*zip(block.unbind(), *views)][::-1]
             self._row.zero_()
             self._row[0].fill_(block.data_ptr())
-        self._is_taken = False
 
     def write(self) -> None:
         """Launches the kernel."""
@@ -94,6 +94,7 @@ class Lanes:
         parts: what of a step's result, a tree of tensors, ``copies`` has after it on a GPU.
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         env: Env,

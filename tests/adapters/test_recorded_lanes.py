@@ -19,12 +19,14 @@ N = 5
 class Sums:
     """Adds actions to a number that its counter of draws gives. Lane i ends after 2 + i steps."""
 
-    n_envs, device = N, torch.device("cpu")
+    n_envs = N
     obs_space, action_space = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 3)
 
-    def __init__(self):
-        self.counts, self.ages = torch.zeros(N, dtype=torch.int32), torch.zeros(N)
-        self.ended, self.sums = torch.zeros(N, dtype=torch.bool), torch.zeros(N)
+    def __init__(self, device="cpu"):
+        self.device = torch.device(device)
+        self.ages, self.sums = (torch.zeros(self.n_envs, device=device) for _ in range(2))
+        self.counts, self.ended = self.ages.int(), self.ages.bool()
+        self.limits = 2 + torch.arange(self.n_envs, device=device) % 50
         self.resets = engine.Resets()
 
     def reset(self, seed=None, mask=None):
@@ -32,7 +34,7 @@ class Sums:
 
     def begin(self, mask):
         self.ended.copy_(mask)
-        return self.world(torch.ones(N, 1))
+        return self.world(torch.ones_like(self.ages)[:, None])
 
     def step(self, decision):
         return self.resets.keep(self.world(decision.actions))
@@ -43,7 +45,7 @@ class Sums:
         self.ages.add_(1).masked_fill_(begins, 0)
         start = (self.counts % 977).float()
         self.sums.copy_(torch.where(begins, start, self.sums + actions[:, 0]))
-        self.ended.copy_(self.ages >= 2 + torch.arange(N))
+        self.ended.copy_(self.ages >= self.limits)
         return arrdict(
             obs=torch.stack([self.sums, self.ages], 1)[:, None],
             reward=(~begins).float(),
@@ -89,36 +91,83 @@ def test_any_order_of_calls_shows_what_plain_lanes_do(same_step, monkeypatch):
     assert len(recordings) == 3 and all(isinstance(one, capture.Graph) for one in recordings)
 
 
-@pytest.mark.parametrize("same_step", (False, True))
-def test_copies_of_a_graph_stay_as_they_were(same_step, monkeypatch, cuda_on_cpu):
-    """In blocks of three rows, and after a step that was interrupted behind the graph."""
-    graphs_on_cpu.install(monkeypatch)
-    monkeypatch.setattr(lane_steps, "BLOCK_ROWS", 3)
+class ManyParts(Sums):
+    """Of more parts than one launch copies, some of which begin at odd addresses."""
+
+    n_envs = 1501
+
+    def world(self, actions):
+        rows = (self.sums * torch.arange(25, device=self.device)[:, None]).unbind()
+        return arrdict(super().world(actions), metrics=arrdict(zip(map(str, range(25)), rows)))
+
+
+def kernels_on_cpu(env, cuda_on_cpu, monkeypatch):
+    """Has an environment count as on a GPU, and graphs repeat kernels that copy."""
 
     def launch(*args, **fields):
         if graphs_on_cpu.GraphOnCpu.is_recording:
             graphs_on_cpu.GraphOnCpu.recorded.append((cuda_on_cpu, args, fields, None))
-        else:
+        if not graphs_on_cpu.GraphOnCpu.is_recording or fields["row"] is None:
             cuda_on_cpu(*args, **fields)
 
+    graphs_on_cpu.install(monkeypatch)
     monkeypatch.setattr(copies, "launch", launch)
-    mode = "same_step" if same_step else "next_step"
-    plain, graphs = (adapters.VectorEnv(Sums(), mode, to_numpy=False) for _ in range(2))
-    for name, leaf in vars(graphs.env).items():
+    for name, leaf in vars(env).items():
         if isinstance(leaf, torch.Tensor):
-            setattr(graphs.env, name, cuda_on_cpu.tensor(leaf))
-    graphs.lanes._on_gpu, kept = True, []
-    plain.reset(seed=3)
-    graphs.reset(seed=3)
-    for i in range(20):
-        actions = torch.arange(N) % 3
-        expected = plain.step(actions)
-        shown = graphs.step(actions)
-        assert graphs.lanes.copies and isinstance(graphs.lanes._step, capture.Graph)
-        kept.append((expected, shown))
-        if i == 10:
-            plain.step(actions)
-            graphs.lanes.step(actions)
-    for expected, shown in kept:
-        pairs = zip(*map(tree_leaves, (expected, shown)), strict=True)
-        assert all(torch.equal(one, other) for one, other in pairs)
+            setattr(env, name, cuda_on_cpu.tensor(leaf))
+
+
+@pytest.mark.parametrize("device", ("cpu", pytest.param("cuda", marks=pytest.mark.cuda)))
+@pytest.mark.parametrize("mode", ("next_step", "same_step", "disabled"))
+def test_copies_of_a_graph_stay_as_they_were(mode, device, monkeypatch, request):
+    """In blocks of few rows, most of which are dropped early, beside another graph's; after steps
+    that are interrupted before and behind the graph; in inference mode or not.
+    """
+    monkeypatch.setattr(lane_steps, "BLOCK_BYTES", 700_000)
+    plain, *others = (ManyParts(where) for where in ("cpu", device, device))
+    if device == "cpu":
+        for env in others:
+            kernels_on_cpu(env, request.getfixturevalue("cuda_on_cpu"), monkeypatch)
+    plain = adapters.VectorEnv(plain, mode, to_numpy=False)
+    with torch.inference_mode():
+        others = [adapters.VectorEnv(env, mode, to_numpy=False) for env in others]
+    vectors, kept = (plain, *others), []
+    for vector in vectors:
+        vector.lanes._on_gpu = vector is not plain
+        vector.reset(seed=3)
+    for i in range(30):
+        actions = (torch.arange(plain.num_envs) + i) % 3
+        if i in (10, 20):
+            copied = others[0].lanes.copies
+            if i == 20:
+                copied._blank.clear()
+            with pytest.raises(KeyboardInterrupt), monkeypatch.context() as patch:
+                patch.setattr(copied, "take" if i == 10 else "_row", Interrupted())
+                others[0].step(actions)
+            if i == 10:
+                plain.step(actions)
+                others[1].step(actions)
+        with torch.inference_mode(i % 4 == 1):
+            shown = [vector.step(actions) for vector in vectors]
+        if mode == "disabled":
+            mask = shown[0][2] | shown[0][3]
+            shown += [vector.reset(options={"reset_mask": mask}) for vector in vectors]
+        kept += [shown] * (i % 3 == 0 or i in (10, 20))
+    for vector in others:
+        assert vector.lanes.copies and isinstance(vector.lanes._step, capture.Graph)
+    for shown in kept:
+        for start in range(0, len(shown), 3):
+            expected, *ours = map(tree_leaves, shown[start : start + 3])
+            for leaves in ours:
+                pairs = zip(expected, leaves, strict=True)
+                assert all(torch.equal(one, other.cpu()) for one, other in pairs)
+
+
+class Interrupted:
+    def __call__(self, *args, **kwargs):
+        raise KeyboardInterrupt
+
+    def new_empty(self, *args, **kwargs):
+        return torch.empty(*args, **kwargs)
+
+    zero_ = __call__
