@@ -212,8 +212,10 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(case, amount, cuda_on_cpu, mon
 
 
 @pytest.mark.cuda
+@pytest.mark.parametrize("n_warps", (3, N))
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_cpu_and_gpu_agree_on_every_bit(case):
+def test_cpu_and_gpu_agree_on_every_bit(case, n_warps, monkeypatch):
+    monkeypatch.setattr(engine.operations, "MAX_SPAWN_WARPS", n_warps)
     same_bits(trajectory("cpu", **case), trajectory("cuda", **case))
 
 

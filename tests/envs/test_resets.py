@@ -248,21 +248,24 @@ def test_captured_resets_are_resets_and_do_not_synchronise(name):
             seed, mask = seed + 1, ~mask
 
 
-@pytest.mark.parametrize("on_gpu", [False, True], ids=["cpu", "cuda kernels"])
+@pytest.mark.parametrize(
+    "on", ["cpu", "cuda kernels", pytest.param("cuda", marks=pytest.mark.cuda)]
+)
 @pytest.mark.parametrize("name", ["explorer", "memory", "keys", "pointgoal"])
-def test_lanes_that_begin_in_place_begin_as_elsewhere(name, on_gpu, request, monkeypatch):
+def test_lanes_that_begin_in_place_begin_as_elsewhere(name, on, request, monkeypatch):
     """A subclass computes a new world, of which it takes the rows of the lanes that begin. After
     each reset the state is equal too, of these lanes and of the others.
     """
     kind, settings = MAKERS[name]
-    own, other = (one(N, device="cpu", **settings) for one in (kind, type("Other", (kind,), {})))
-    if on_gpu:
+    device, kinds = "cuda" if on == "cuda" else "cpu", (kind, type("Other", (kind,), {}))
+    own, other = (one(N, device=device, **settings) for one in kinds)
+    if on == "cuda kernels":
         request.getfixturevalue("cuda_on_cpu").install(monkeypatch)
     assert contract.same(own.reset(), other.reset())
-    for decision in decisions(own, 3 if on_gpu else 20):
+    for decision in decisions(own, 3 if on == "cuda kernels" else 20):
         worlds = [env.step(decision).clone() for env in (own, other)]
         assert contract.same(*worlds)
-        mask = worlds[0].terminal | worlds[0].truncated | (torch.arange(N) == 3)
+        mask = worlds[0].terminal | worlds[0].truncated | (torch.arange(N, device=device) == 3)
         mask = torch.stack([mask, ~mask], 1)[:, 0]  # not contiguous
         address = own._resets.last.obs.rgb.data_ptr()
         worlds = [env.reset(mask=mask) for env in (own, other)]
@@ -274,5 +277,5 @@ def test_lanes_that_begin_in_place_begin_as_elsewhere(name, on_gpu, request, mon
         assert contract.same(*worlds)
         states = [state_tree(env) for env in (own, other)]
         assert all(is_same(leaf, states[1][path]) for path, leaf in states[0].items())
-    nobody = torch.zeros(N, dtype=torch.bool)
+    nobody = torch.zeros(N, dtype=torch.bool, device=device)
     assert own._begin_in_place(nobody) and not other._begin_in_place(nobody)

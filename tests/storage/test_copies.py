@@ -79,6 +79,17 @@ def test_copies_what_copy_does(device, monkeypatch):
     assert n_plain > 2 * copies._MAX_COPIES and len(launches) == n_launches
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("start", (0, 1))
+def test_the_largest_copies_arrive(start):
+    """In words of 16 bytes, and byte by byte, up to 2 GiB."""
+    source = torch.randint(256, (2**31,), dtype=torch.uint8, device="cuda")
+    target = torch.zeros_like(source)
+    copy_all([(target[start : start - 1 or None], source[start : start - 1 or None])])
+    assert torch.equal(target[1:-1], source[1:-1])
+    assert int(target[-1 if start == 0 else 0]) == 0
+
+
 def test_sources_that_nobody_else_holds_are_copied(device):
     """Conversions between them would take the memory of a source that is freed too early."""
     source = torch.arange(10_000.0, device=device)
