@@ -58,6 +58,9 @@ def handled(
 
     def handle(number, frame) -> None:
         nonlocal ends_after
+        # C++ imports parts of PyTorch, and aborts at an exception; nothing is to be saved yet
+        if _is_importing_torch() and callable(outer := before.get(number)):
+            return outer(number, frame)
         is_repeated = ends_after is not None and time.monotonic() > ends_after
         if ends_after is None and number not in ANNOUNCING:
             ends_after = time.monotonic() + SAME
@@ -114,6 +117,11 @@ def _install(handler: Callable) -> dict[int, Callable | int | None]:
         return {}
     is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # by nohup
     return {n: signal.signal(n, handler) for n in SIGNALS[: -1 if is_ignored else None]}
+
+
+def _is_importing_torch() -> bool:
+    spec = getattr(sys.modules.get("torch"), "__spec__", None)
+    return getattr(spec, "_initializing", False)
 
 
 def _write(stream: TextIO | None, line: str) -> None:

@@ -6,6 +6,8 @@ import json
 import os
 import pathlib
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -63,6 +65,25 @@ def composing(monkeypatch, number):
     from omegaconf import DictConfig
 
     signalled(monkeypatch, DictConfig, "_validate_set", number, call=20)
+
+
+IMPORTING = """
+import importlib.machinery, os, signal, sys, types
+from megastep.agents.launch import signals
+signals.exit_on_signals("train")
+sys.modules["torch"] = torch = types.ModuleType("torch")
+torch.__spec__ = importlib.machinery.ModuleSpec("torch", None)
+torch.__spec__._initializing = True
+with signals.interrupting():
+    os.kill(os.getpid(), signal.SIGINT)
+"""
+
+
+def test_a_signal_while_torch_is_imported_ends_the_process_at_once():
+    """An exception there would abort it, where C++ imports."""
+    ended = subprocess.run([sys.executable, "-c", IMPORTING], capture_output=True, text=True)
+    assert ended.returncode == 130, ended.stderr
+    assert ended.stderr.endswith(": stopped by SIGINT\n")
 
 
 def importing(monkeypatch, number):
