@@ -23,7 +23,7 @@ from megastep.geometries import files
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 IMAGES, PAGES = DOCS / "images", DOCS / "play"
-MOST = 18_000_000  # bytes of both
+MOST = 20_000_000  # bytes of both
 #: What films or draws each: words for record.py, or for show_homes.py.
 FILMS = {
     "explorer.gif": "run=explorer_anywhere home=3 steps=200 dpi=70 speed=2",
@@ -33,7 +33,7 @@ FILMS = {
     "pointgoal.png": "run=pointgoal_anywhere home=4 steps=30",
     "homes.png": "run=pointgoal_anywhere homes=[1,2,3,4] steps=25 theme=dark dpi=70",
     "deathmatch.png": "run=deathmatch_anywhere against=hunter home=27 steps=60",
-    "hideandseek.png": "run=hideandseek_quadrant home=3 steps=120 dpi=70",
+    "hideandseek.png": "run=hideandseek_quadrant against=hideandseek_ramps home=3 steps=180 dpi=70",
     "memory.gif": "run=memory_9 steps=160 dpi=60 speed=2 seed=2",
     "keys.png": "run=keys_anywhere steps=60",
     "minimal.png": "env=minimal geometry=box steps=20",
@@ -66,7 +66,8 @@ FILMS |= {
 MOVING = {
     "pointgoal.mp4": "run=pointgoal_anywhere home=4 steps=160 dpi=70 speed=2",
     "deathmatch.mp4": "run=deathmatch_anywhere against=hunter home=27 steps=160 dpi=70 speed=2",
-    "hideandseek.mp4": "run=hideandseek_quadrant home=3 steps=160 dpi=70 speed=2",
+    "hideandseek.mp4": "run=hideandseek_quadrant against=hideandseek_ramps home=3 steps=220 dpi=70 "
+    "speed=2",
     "keys.mp4": "run=keys_anywhere steps=160 dpi=70 speed=2",
     "minimal.mp4": "env=minimal geometry=box steps=100 dpi=80",
     "pong-court.mp4": "run=PONG steps=200 dpi=80",
@@ -86,7 +87,7 @@ TRAINED = {
 GALLERY = {
     "explorer.html": "run=explorer_anywhere homes=[3,0,1,2]",
     "deathmatch.html": "run=deathmatch_anywhere homes=[27,0,1]",
-    "hideandseek.html": "run=hideandseek_quadrant homes=[3,0,1]",
+    "hideandseek.html": "run=hideandseek_quadrant against=hideandseek_ramps homes=[3,0,1]",
     "memory.html": "run=memory_9",
     "keys.html": "run=keys_anywhere",
     "pointgoal.html": "run=pointgoal_anywhere homes=[4,0,1]",
