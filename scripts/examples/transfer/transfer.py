@@ -157,10 +157,10 @@ def main():
             fail("--policy is missing: the .onnx file of megastep export, whose robot is driven")
         try:
             policy = RobotPolicy(words.policy)
+            episodes = read(path)[words.first : words.first + words.n]
         except (ValueError, OSError) as error:
             fail(str(error))
         known = {(row["driver"], row["simulator"], row["episode"]) for row in rows}
-        episodes = read(path)[words.first : words.first + words.n]
         for kind in words.controllers:
             driver, label = controller(kind, policy), words.label if kind == "trained" else kind
             for name in words.simulators:
