@@ -6,6 +6,7 @@ loader = torch.utils.data.DataLoader(episodes, 32, shuffle=True, collate_fn=mega
 """
 
 import json
+import operator
 import os
 import re
 from collections.abc import Sequence
@@ -90,6 +91,7 @@ class Episodes(Dataset):
         return len(self.files)
 
     def __getitem__(self, index: int) -> arrdict:
+        index = operator.index(index)
         try:
             return self.codec.decoded(episodes.read(self.files[index]))
         except (OSError, ValueError, KeyError) as error:

@@ -50,6 +50,17 @@ class Kind:
             raise AttributeError(f"{self.__dict__.get('name')} has no attribute {name!r}{hint}")
         return getattr(self._objects.all, name)[:, self.slots]
 
+    def __setattr__(self, name: str, value: object) -> None:
+        if name not in self.tensors:
+            return super().__setattr__(name, value)
+        own = getattr(self, name)
+        is_tensor = isinstance(value, torch.Tensor)  # `doors.open |= mask` assigns `own`
+        if not is_tensor or (value.data_ptr(), value.shape) != (own.data_ptr(), own.shape):
+            kind = f"objects[{self.name!r}]"
+            raise AttributeError(
+                f"{name} cannot be replaced; write into it: {kind}.{name}[:] = ..."
+            )
+
     def place(self, mask: torch.Tensor, colours: torch.Tensor | int | None = None) -> None:
         """Puts objects at random points in rooms, on no agent and no other object.
 
@@ -104,6 +115,7 @@ class Kind:
         """Has agents pick up objects where ``mask``, (N, A, K) bool, is True. If several want one,
         the first has it. Nobody picks up what is not there, or carried.
         """
+        mask = self._of_agents(mask)
         taken = mask.any(1) & self._loose()
         self.carriers.copy_(torch.where(taken, mask.int().argmax(1).int(), self.carriers))
 
@@ -115,8 +127,7 @@ class Kind:
         """Has agents put down, where they are, what they carry, where ``mask``, (N, A) or (N, A, K)
         bool, is True.
         """
-        mask = mask if mask.ndim == 3 else mask[..., None]
-        self.carriers.masked_fill_((self.carried() & mask).any(1), -1)
+        self.carriers.masked_fill_((self.carried() & self._of_agents(mask)).any(1), -1)
 
     def _loose(self) -> torch.Tensor:
         return self.visible & ~self.open & (self.carriers < 0)
@@ -130,6 +141,16 @@ class Kind:
                 f"per {self.name}"
             )
         return mask.view(n, -1).expand(n, k)
+
+    def _of_agents(self, mask) -> torch.Tensor:
+        (n, k), a = self.visible.shape, len(self._agents)
+        is_mask = isinstance(mask, torch.Tensor) and mask.dtype == torch.bool
+        if not is_mask or mask.shape not in ((n, a), (n, a, 1), (n, a, k)):
+            raise ValueError(
+                f"mask must be a bool tensor of shape ({n}, {a}) or ({n}, {a}, {k}), one per agent "
+                f"or per agent and {self.name}"
+            )
+        return mask if mask.ndim == 3 else mask[..., None]
 
     def _paint(self, mask, colours) -> None:
         if isinstance(colours, int):

@@ -48,7 +48,7 @@ class Movable(Kind):
         several want one, the first has it. Nobody grabs what is not there, carried, held, or
         locked. Elevated agents grab nothing, unless they may.
         """
-        objects = self._objects.all
+        objects, mask = self._objects.all, self._of_agents(mask)
         if objects.elevated is not None and not objects.grab_elevated:
             mask = mask & (objects.elevated <= 0)[..., None]
         free = self._loose() & ~self.locked & (self.holders < 0)
@@ -62,8 +62,7 @@ class Movable(Kind):
 
     def release(self, mask: torch.Tensor) -> None:
         """Has agents let go of what they hold where ``mask``, (N, A) or (N, A, K) bool, is True."""
-        mask = mask if mask.ndim == 3 else mask[..., None]
-        self.holders.masked_fill_((self.held() & mask).any(1), -1)
+        self.holders.masked_fill_((self.held() & self._of_agents(mask)).any(1), -1)
 
     def lock(self, mask: torch.Tensor, team: torch.Tensor | int) -> None:
         """Locks objects where ``mask``, (N,) or (N, K) bool, is True, for a team: an integer, or

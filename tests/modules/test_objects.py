@@ -214,6 +214,12 @@ def test_bad_calls_are_named():
     core, _, objects = make({"key": 2})
     with pytest.raises(ValueError, match="mask must be a bool tensor"):
         objects["key"].place(torch.ones(3, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"bool tensor of shape \(8, 2\) or \(8, 2, 2\), "):
+        objects["key"].carry(torch.ones(N, A, 2))
+    with pytest.raises(AttributeError, match=r"write into it: objects\['key'\].solid\[:\] = "):
+        objects["key"].solid = torch.ones(N, 2, dtype=torch.bool)
+    objects["key"].solid |= torch.ones(N, 2, dtype=torch.bool)
+    assert objects.all.solid.all()
     with pytest.raises(ValueError, match="give all kinds to one Objects"):
         Objects([toys.box()] * 4, core, {"crate": Crate(1)})
     with pytest.raises(ValueError, match="colours must be of red"):
