@@ -31,7 +31,7 @@ class GraphOnCpu:
     """Stands in for `torch.cuda.CUDAGraph`."""
 
     is_recording = False
-    recorded: list = []  # of the graph that is recorded last
+    recorded: list = []  # of the graph that is being recorded
 
     def __init__(self):
         self.operations = []
@@ -66,7 +66,7 @@ def _record(graph, stream=None, capture_error_mode="global"):
         with _Recorder(graph.operations):
             yield
     finally:
-        GraphOnCpu.is_recording = False
+        GraphOnCpu.is_recording, GraphOnCpu.recorded = False, []
 
 
 class _Stream:

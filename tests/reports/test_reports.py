@@ -212,7 +212,9 @@ def test_runs_that_share_no_metric(here, tmp_path, capsys):
     odd = shutil.copytree(here / "a", tmp_path / "odd")
     (odd / "perf.jsonl").unlink()
     shutil.rmtree(odd / "evaluations", ignore_errors=True)  # of other tests
-    (odd / "metrics.jsonl").write_text('{"samples": 1, "x": 1.0}\n')
+    last = json.loads((odd / "metrics.jsonl").read_text().splitlines()[-1])
+    row = dict(samples=last["samples"], x=1.0)  # an interrupted run would be left out
+    (odd / "metrics.jsonl").write_text(json.dumps(row) + "\n")
     words = f"run=[{here / 'a'},{odd}]", f"file={tmp_path / 'plot.pdf'}"
     assert compare.main([*words]) == 2
     assert "share no metric, so they cannot be compared" in capsys.readouterr().err
