@@ -23,7 +23,7 @@ from torch import nn
 from megastep import spaces
 from megastep.agents import package
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.factory import components
+from megastep.agents.factory import components, settings
 from megastep.agents.factory import make as factory
 from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.heads import FORBIDDEN
@@ -136,9 +136,10 @@ def write(run: Path, path: Path) -> str:
     """
     loaded = folders.load_checkpoint(run, False, "cpu")
     trained = factory.config_of(loaded)
-    geometry = components.settings_for("geometry", components.HOMES, n=N_HOMES)
-    homes = factory.homes(trained.env, geometry, "test")
-    env = factory.make_sample(trained.env, homes, seed=trained.seed, device="cpu")
+    try:
+        env = _env(trained, components.settings_for("geometry", components.HOMES, n=N_HOMES))
+    except UserError:  # its environment needs floor plans of another kind
+        env = _env(trained, settings.changed_known(trained.geometry, n=N_HOMES))
     restore.load_wrappers(env, loaded)
     policy = restore.policy_of(loaded, env)
     step = Step(policy, env.reset())
@@ -156,6 +157,11 @@ def write(run: Path, path: Path) -> str:
         f"{inputs} -> {outputs}; in 1,000 steps its numbers differ from the policy's by at most "
         f"{difference:.1g}"
     )
+
+
+def _env(trained, geometry) -> Env:
+    homes = factory.homes(trained.env, geometry, "test")
+    return factory.make_sample(trained.env, homes, seed=trained.seed, device="cpu")
 
 
 def description(step: Step, env: Env) -> dict:

@@ -142,6 +142,13 @@ def test_an_agent_of_gymnasium_is_exported(here):
     assert about["steps_per_second"] == 50 and "robot" not in about
 
 
+@pytest.mark.nightly
+def test_an_agent_that_plays_in_no_homes_is_exported(here):
+    words = ["env=hideandseek", "env.n_envs=4", "env.res=8", "env.subsample=1", "geometry.n=4"]
+    assert train.main([*TINY[2:3], *TINY[4:], *words, "samples=256", "folder=run"]) == 0
+    assert export.main(["run=run", "format=torch"]) == 0
+
+
 class Odd(torch.nn.Module):
     """A core that asks a tensor for its value, which no graph has."""
 
