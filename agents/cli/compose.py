@@ -85,10 +85,6 @@ class Folders(SearchPathPlugin):
                 break
 
 
-plugins.Plugins.instance().register(BlockSource)
-plugins.Plugins.instance().register(Folders)
-
-
 def blocks_of(device: object, learner: object) -> dict[str, bool]:
     """Returns the names of blocks, and whether they apply on a device and with a learner."""
     is_cpu = device == "cpu" or (device == "auto" and not gpu.is_available())
@@ -173,6 +169,8 @@ class Composer:
         STORE.store(group="logger", name="none", node={})
         Folders.beside = os.path.abspath(folder) if folder else ""
         global_hydra.GlobalHydra.instance().clear()
+        for kind in (BlockSource, Folders):  # a launcher's process may have forgotten them
+            plugins.Plugins.instance().register(kind)
         hydra.initialize_config_dir(MAIN, job_name=command.name, version_base="1.3")
         self.loader = global_hydra.GlobalHydra.instance().config_loader()
         self.members = functools.cache(self.loader.get_group_options)

@@ -490,7 +490,6 @@ def test_arrays_are_those_of_the_cpu(mode):
 @pytest.mark.parametrize(
     "name, package",
     [
-        ("gymnasium", "gymnasium"),
         ("sb3", "stable_baselines3"),
         ("sb3_recurrent", "sb3_contrib"),
         ("torchrl", "torchrl"),

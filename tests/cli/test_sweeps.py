@@ -251,7 +251,7 @@ def test_a_job_is_the_mean_of_its_seeds(here, monkeypatch):
     assert runs == [(6 + i, f"mine/3_{s}", ["env.pay=2", s]) for i, s in enumerate(job.seeds)]
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 def test_preempted_submitit_job_continues_its_checkpoint(here):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     total = f"samples={400 * UPDATE}"
