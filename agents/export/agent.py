@@ -147,6 +147,9 @@ def write_loaded(
             f"{file.stem!r} is not a name for an agent; use small letters, digits and _"
         )
     config = {**loaded.config, "train": loaded.config["train"] | PRIVATE}
+    opponents = config["train"].get("opponents") or {}
+    if "/" in (bot := opponents.get("bot_class") or ""):  # a file of that machine
+        config["train"]["opponents"] = opponents | {"bot_class": Path(bot).stem}
     state = rounded(restore.policy_of(loaded, env))
     if names := trust.foreign_names(config):
         console.warn(f"{file} needs {', '.join(names)}, and of others who load it trust=true")

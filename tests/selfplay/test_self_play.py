@@ -7,7 +7,8 @@ import torch
 
 from megastep import capture, devices
 from megastep.agents.cli import evaluate, train
-from megastep.agents.runs import checkpoint, json_lines
+from megastep.agents.export import agent
+from megastep.agents.runs import agent_file, checkpoint, json_lines
 from megastep.envs.pong import CELL
 from tests.cli.test_duels import PONG, UPDATE
 from tests.cli.test_train import configured
@@ -66,6 +67,9 @@ def test_one_role_learns_against_the_agent_of_a_run(here, capsys):
     folder = train.run(configured(*words, tiny=OPPOSED))
     last = json_lines.read(folder / "metrics.jsonl")[-1]
     assert "episode/return/right" in last and "episode/return/left" not in last
+    agent.write(str(folder), here / "sole.safetensors")
+    told = agent_file.read(here / "sole.safetensors", None).config["train"]["opponents"]
+    assert told["bot_class"] == first.name, "without folders of this machine"
     assert train.main([*OPPOSED, "samples=100", "opponents.bot_class=runs/none"]) == 2
     assert "(bots are bot, explorer, hunter, " in capsys.readouterr().err
     words = "opponents.role=right", f"opponents.bot_class={first}", "env.self_play=true"
