@@ -78,6 +78,12 @@ class Resets:
                     "reset(mask=...) leaves the other lanes as they are in the last world, but "
                     "there is none: call reset() first"
                 )
+            for path, (*_, leaf) in walk(world, torch.Tensor).items():
+                if is_expanded(leaf):
+                    raise ValueError(
+                        f"reset(mask=...) writes single lanes of the last world, but world{path} "
+                        "has one number in memory for several (expand): call clone() on it"
+                    )
         chosen = everyone.fill_(True) if mask is None else mask
         if seed is not None:
             self._seed(env, seed, chosen)

@@ -2,12 +2,14 @@
 of a kind, D layouts.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from megastep import engine
+from megastep.engine import checks
 from megastep.engine.objects import NUMBERS
 from megastep.ragged import RaggedNumpy
 
@@ -87,6 +89,8 @@ class Kind:
         """Returns (N, A, K) bool: which agents are within ``reach`` metres of which objects'
         edges. Nobody touches an object that is not there, or is carried.
         """
+        if reach != 0:
+            checks.number("reach", reach, 0, math.inf, "metres")
         agents, objects = self._objects.core.agents, self._objects.all
         offset = agents.positions[:, :, None] - self.positions[:, None]
         angle = torch.deg2rad(self.angles)[:, None]

@@ -4,6 +4,7 @@ kind.
 
 import torch
 
+from megastep.engine import checks
 from megastep.modules.kinds import Kind
 
 #: The tensors that movable kinds have besides those of all kinds.
@@ -65,10 +66,12 @@ class Movable(Kind):
         self.holders.masked_fill_((self.held() & self._of_agents(mask)).any(1), -1)
 
     def lock(self, mask: torch.Tensor, team: torch.Tensor | int) -> None:
-        """Locks objects where ``mask``, (N,) or (N, K) bool, is True, for a team: an integer, or
-        (N, K) integers. Nothing moves them, and nobody holds them. What is locked keeps its owner.
+        """Locks objects where ``mask``, (N,) or (N, K) bool, is True, for a team: an integer of
+        at least 0, or (N, K) of them. Nothing moves them, and nobody holds them. What is locked
+        keeps its owner.
         """
         mask = self._broadcast(mask) & self.visible & ~self.locked
+        team = checks.integer("team", team, 0) if isinstance(team, int) else team
         self.owners.copy_(torch.where(mask, team, self.owners))
         self.locked.logical_or_(mask)
         self._stop(mask)

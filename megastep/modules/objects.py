@@ -18,7 +18,7 @@ from megastep.engine.objects import FORCE, GRIP, MAX_MASS, MAX_OBJECTS, RAMP_STE
 from megastep.modules.kinds import Doors, Kind
 from megastep.modules.lifecycle import derived_seed
 from megastep.modules.movable import Movable
-from megastep.modules.spawning import MAX_SPAWNS, cached_points
+from megastep.modules.spawning import MAX_SPAWNS, cached_points, of_layouts
 from megastep.ragged import RaggedNumpy
 from megastep.scene import linear
 
@@ -137,7 +137,7 @@ class Objects:
         if not checks.instance("kinds", kinds, Mapping):
             raise ValueError("kinds must hold at least one kind of objects, but is empty")
         self.core = core
-        geometries = geometries[: len(core.scenery.layouts)]
+        geometries = of_layouts(geometries, core)
         shapes, sizes, widths, solid, movable, names, slots = [], [], [], [], [], [], {}
         openings = doorways(geometries)
         for name, kind in kinds.items():

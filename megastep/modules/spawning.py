@@ -147,9 +147,7 @@ class RandomSpawns:
         self.seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         if points is None:
             size = n_spawns, core.n_agents, core.agents.radius
-            points = torch.from_numpy(
-                cached_points(geometries[: self._n_layouts], *size, self.seed)
-            )
+            points = torch.from_numpy(cached_points(of_layouts(geometries, core), *size, self.seed))
         self.points = torch.as_tensor(points, device=core.device)
         zeros = torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
         self.counts, self.point_index = zeros, zeros.clone()
@@ -175,6 +173,17 @@ class RandomSpawns:
             n, device = self._n_layouts, self.core.device
             self.cumulative = torch.arange(1, n + 1, dtype=torch.int32, device=device)
         return self.cumulative
+
+
+def of_layouts(geometries: Sequence[dotdict], core: Core) -> Sequence[dotdict]:
+    """Returns the geometries. ValueError unless there is one for each layout of the scenery."""
+    if len(geometries) != len(core.scenery.layouts):
+        raise ValueError(
+            f"geometries must be those that the scenery was made from, one for each of its "
+            f"{len(core.scenery.layouts)} layouts, but {len(geometries)} were given: use the list "
+            "that scene.scenery got, such as scene.spread(geometries, n_envs)"
+        )
+    return geometries
 
 
 def cached_points(
@@ -207,7 +216,7 @@ class FreePoints:
     where an agent is 5 cm clear of every wall. A point is drawn in the layout that the environment
     shows at the call, so call it after the spawner. The k-th draw is the same on the CPU, on a GPU
     and in a CUDA graph; a call does not synchronise. Raises ValueError if a geometry has no point
-    where an agent fits, or there are fewer geometries than layouts.
+    where an agent fits, or there is not one geometry for each layout.
 
     Args:
         geometries: those that the scenery was made from.
@@ -232,13 +241,8 @@ class FreePoints:
         n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
         seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         seed = derived_seed(seed, "points")
-        n_layouts = len(core.scenery.layouts)
-        if len(geometries) < n_layouts:
-            raise ValueError(
-                f"geometries must be those that the scenery was made from, one for each of its "
-                f"{n_layouts} layouts, but {len(geometries)} were given"
-            )
-        points = cached_points(geometries[:n_layouts], n_points, 1, core.agents.radius, seed)
+        geometries = of_layouts(geometries, core)
+        points = cached_points(geometries, n_points, 1, core.agents.radius, seed)
         self.points = torch.as_tensor(points, device=core.device)
         self.generator = CounterGenerator(core.n_envs * self.per_env, seed, core.device)
 

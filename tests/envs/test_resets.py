@@ -177,6 +177,10 @@ def test_what_does_not_fit_is_named():
     env.reset()
     with pytest.raises(ValueError, match=r"mask must be a torch.bool tensor of shape \(7,\)"):
         env.reset(mask=torch.ones(N))
+    env._resets.last["terminal"] = torch.zeros(1, dtype=torch.bool).expand(N)
+    with pytest.raises(ValueError, match=r"world\['terminal'\] has one number in memory"):
+        env.reset(mask=torch.ones(N, dtype=torch.bool))
+    env.reset()
     with pytest.raises(ValueError, match="seed must be an integer from 0"):
         env.reset(seed=-1)
     state = EnvState(env)  # a mask was never given, so the last world is not saved

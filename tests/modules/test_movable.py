@@ -250,5 +250,8 @@ def test_bad_calls_are_named():
     _, objects, _ = room({"key": 1})
     with pytest.raises(AttributeError, match="key has no attribute 'masses' .only kinds with"):
         _ = objects["key"].masses
+    _, objects, _ = room({"box": Crate(1, movable=True)})
+    with pytest.raises(ValueError, match="team must be an integer of at least 0, but -1"):
+        objects["box"].lock(torch.ones(2, dtype=torch.bool), -1)
     with pytest.raises(ValueError, match="force must be a number of newtons"):
         room({"box": Crate(1, movable=True)}, force=-1.0)

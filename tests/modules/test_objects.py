@@ -222,6 +222,16 @@ def test_bad_calls_are_named():
     assert objects.all.solid.all()
     with pytest.raises(ValueError, match="give all kinds to one Objects"):
         Objects([toys.box()] * 4, core, {"crate": Crate(1)})
+    geometries = [toys.box()] * 3
+    other = Core(scene.scenery(geometries, n_envs=2, device=core.device))
+    for given in geometries[:2], geometries * 2:
+        message = f"for each of its 3 layouts, but {len(given)} were given: use"
+        with pytest.raises(ValueError, match=message):
+            Objects(given, other, {"crate": Crate(1)})
+        with pytest.raises(ValueError, match=message):
+            modules.RandomSpawns(given, other)
+    with pytest.raises(ValueError, match="reach must be a number of metres above 0, but -1"):
+        objects["key"].touching(-1)
     with pytest.raises(ValueError, match="colours must be of red"):
         make({"key": 2}, colours=["rainbow"])
     objects["key"].place(everywhere(core), colours=99)

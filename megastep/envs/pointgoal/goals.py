@@ -89,8 +89,7 @@ def goal_fields(
             f"goals need 0 <= nearest < furthest metres, but {nearest:g} and {furthest:g} were "
             f"given"
         )
-    device = core.device
-    geometries = geometries[: len(core.scenery.layouts)]
+    geometries, device = spawning.of_layouts(geometries, core), core.device
     n_bytes = [2 * N_GOALS * geodesics.n_cells(g) for g in geometries]  # of fields in fp16
     engine.fit(len(geometries), float(np.mean(n_bytes)), device, "layouts")
     layouts = all_geodesics(geometries, core.agents.radius, core.seed, device)
