@@ -71,7 +71,7 @@ class Codec:
         known = NAMES.get(rest)
         if known and not (known == "image" and not self._is_image(path)):
             return known
-        return f"obs.{rest}" if rest in RESERVED or rest in PLANS or not rest else rest
+        return f"obs.{rest}" if rest in RESERVED or rest in PLANS else rest or "obs"
 
     def _is_image(self, path) -> bool:
         space = self.spaces[path]
@@ -109,7 +109,8 @@ class Codec:
         - reward: (T,) float32; terminal, truncated: (T,) bool
         - the rest, such as `mask` and `agent_pos`: as stored, (T + 1, ...), or a floor plan
         """
-        left = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        # files of 0.3.0 have `obs.` for `obs`
+        left = {name.rstrip("."): torch.from_numpy(array) for name, array in arrays.items()}
         leaves = {path: self.decode(path, left.pop(name)) for path, name in self.names.items()}
         leaves = {k: leaf[1:] if k.startswith("actions") else leaf for k, leaf in leaves.items()}
         outcomes = {name: left.pop(name)[1:] for name in OUTCOMES}

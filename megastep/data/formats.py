@@ -100,7 +100,7 @@ def _minari(source, folder, progress) -> None:
             yield minari.data_collector.EpisodeBuffer(
                 id=number,
                 observations=seen,
-                actions=actions if len(actions) > 1 else actions["action"],
+                actions=actions.get("action", actions),
                 rewards=arrays["reward"][1:],
                 terminations=arrays["terminal"][1:],
                 truncations=arrays["truncated"][1:],
@@ -115,7 +115,7 @@ def _minari(source, folder, progress) -> None:
             f"{source.label}-v0",
             buffers(),
             observation_space=Dict({name: obs_space(array) for name, array in first.items()}),
-            action_space=Dict(each) if len(each) > 1 else each["action"],
+            action_space=each.get("action") or Dict(each),
             algorithm_name=source.about["settings"]["player"],
             description=json.dumps(source.about["settings"]),
             jpeg_encoding=False,  # which would blur images by default

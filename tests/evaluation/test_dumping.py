@@ -344,6 +344,21 @@ def test_minari_reads_every_array(twice, monkeypatch):
         assert np.array_equal(one.infos["walls"], file["walls"])
 
 
+def test_one_observation_without_a_name_and_a_dict_of_one_action(tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    words = "env=gymnasium", "env.id=tests.helpers.odd_envs:OddOneKey-v0"
+    one = data.load(dumped(tmp_path / "npz", *words, n=2))
+    file = np.load(one.files[0])
+    assert {"obs", "action.press"} < {*file} and file["obs"].tolist() == [[t] for t in range(11)]
+    assert one[0].obs.shape == (11, 1, 1) and one[0].actions.press.shape == (10, 1)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    dumped(tmp_path / "minari", *words, "format=minari", n=2)
+    theirs = minari.load_dataset("gymnasium_random-v0")[0]
+    assert np.array_equal(theirs.observations["obs"], file["obs"])
+    presses = theirs.actions["action.press"]
+    assert np.array_equal(presses, file["action.press"][1:].argmax(1))
+
+
 def test_lerobot_has_half_frames_a_second_and_statistics_of_each_episode(tmp_path, few):
     pandas = pytest.importorskip("pandas")
     parquet = pytest.importorskip("pyarrow.parquet")

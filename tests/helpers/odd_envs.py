@@ -34,6 +34,12 @@ class Odd(gymnasium.Env):
         return {}
 
 
+class OneKey(Odd):
+    """Its actions are a dict of one space."""
+
+    action_space = spaces.Dict(press=spaces.Discrete(2))
+
+
 class Crash(Odd):
     """Fails in one of 100 steps."""
 
