@@ -186,6 +186,17 @@ class EvalEnv:
             )
 
 
+def check_duels_of(env: settings.Env, device: torch.device) -> None:
+    """As `check_duels`, before homes are made: in a box, if the environment fits in one."""
+    if not (box := factory.homes(env, components.settings_for("geometry", components.BOX), "test")):
+        return
+    try:
+        sample = factory.make_sample(settings.changed_known(env, **FOR_TWO), box, device=device)
+    except UserError:
+        return
+    check_duels(sample)
+
+
 def check_duels(env: Env) -> None:
     """Raises UserError if nobody can be met in an environment."""
     if optional(env, "n_agents") < 2:

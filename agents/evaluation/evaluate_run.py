@@ -36,9 +36,11 @@ def run(cfg: settings.Evaluate) -> Path:
     """
     start, device = time.monotonic(), factory.make_device(cfg.device)
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
-    env_settings, geometry, homes = factory.played_in(cfg, loaded)
     options: dict = dict(episodes=cfg.episodes, seed=cfg.seed, device=device)
     options["is_duel"] = cfg.ratings or cfg.against is not None
+    if options["is_duel"]:
+        eval_env.check_duels_of(cfg.env or factory.config_of(loaded).env, device)
+    env_settings, geometry, homes = factory.played_in(cfg, loaded)
     with env_failures.caught(env_settings, folders.folder_of(loaded.path)):
         if cfg.ratings:
             where = EvalEnv(env_settings, homes, **options)

@@ -17,6 +17,7 @@ from megastep.settings import closest, frozen, parameters_of, sentence, settings
 
 POLICY = "megastep.agents.networks.policy:Policy"
 #: Floor plans unless geometry= says otherwise.
+BOX = "megastep.geometries.sources:box"
 HOMES = "megastep.geometries.sources:homes"
 SUITE = "megastep.geometries.sources:suite"
 OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"

@@ -13,6 +13,7 @@ from megastep import recording
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.evaluation import evaluate_run, playing, statistics
 from megastep.agents.evaluation.statistics import interval
+from megastep.agents.factory import make as factory
 from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.arrdict import arrdict
@@ -27,6 +28,15 @@ def test_stronger_player_wins_from_every_slot():
     assert (played.score == 1).all() and (played.lengths == 1).all()
     assert playing.first_duels(Matrix(64), Always(0), Always(2)).score.sum() == 0
     assert played.slots.tolist() == [0] * 32 + [1] * 32
+
+
+@pytest.mark.parametrize("words", ["against=bot", "ratings=true"])
+def test_one_agent_alone_is_refused_before_homes_are_made(words, monkeypatch, capsys):
+    homes, made = factory.homes, []
+    monkeypatch.setattr(factory, "homes", lambda *how: made.append(how[1].name) or homes(*how))
+    assert evaluate.main(["run=explorer_anywhere", "geometry=suite", "device=cpu", words]) == 2
+    assert "at least two agents, and Explorer has one" in capsys.readouterr().err
+    assert len(made) == 1 and made[0].endswith(":box")
 
 
 @pytest.mark.parametrize("mortal", [False, True])
