@@ -188,11 +188,11 @@ def _per_camera(scenery, agents) -> tuple[int, ...]:
     return lanes if agents.n_cameras == 1 else (*lanes, agents.n_cameras)
 
 
-def _kernel(scenery, res, subsample) -> str:
+def _kernel(scenery, res, subsample, only=None) -> str:
     n_threads = WARP * scenery.n_envs * scenery.n_agents
     room = n_resident_threads(scenery.device)
     # two warps per agent, if agents are few, share whole tiles of the screen: of whole pixels
-    if 3 * n_threads <= room and res > WARP and WARP % subsample == 0:
+    if (1 if only else 3) * n_threads <= room and res > WARP and WARP % subsample == 0:
         return "render_split"
     # with more registers for each warp, until agents are many
     return "render_unspilled" if n_threads <= UNSPILLED_WAVES * room else "render"
@@ -203,7 +203,8 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
     half_width = math.tan(math.radians(agents.fov / 2))
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)  # of an agent
     n = scenery.n_envs * scenery.n_agents
-    kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
+    kernel = _kernel(scenery, res, subsample, outputs.get("only"))
+    kernel = "render" if "indices" in outputs else kernel
     n_warps = BLOCK // WARP
     n_per_block = 1 if kernel == "render_split" else n_warps
     shared *= n_per_block

@@ -147,6 +147,14 @@ def test_choice_of_kernel_on_an_h200(monkeypatch, n_envs, n_agents, res, subsamp
     assert rendering._kernel(scenery, res, subsample) == kernel
 
 
+def test_few_of_a_mask_are_rendered_as_few(monkeypatch):
+    monkeypatch.setattr(rendering, "n_resident_threads", lambda device: 132 * 2048)
+    scenery = SimpleNamespace(n_envs=8448, n_agents=1, device=None)
+    assert rendering._kernel(scenery, 256, 4, only=1) == "render_split"
+    scenery.n_envs += 1
+    assert rendering._kernel(scenery, 256, 4, only=1) == "render_unspilled"
+
+
 @pytest.mark.cuda
 def test_cpu_and_gpu_agree_on_angles_that_no_int_holds():
     angles = torch.tensor([2.0**31, 2.0**38, -(2.0**38), 1e30, -1e30, math.inf, math.nan])
