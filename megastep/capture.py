@@ -158,8 +158,9 @@ def end_failed_recording() -> None:
 class Graph:
     """A function recorded as a CUDA graph. Arguments are those of :func:`capture`.
 
-    A call copies the tensors of its arguments in, replays the graph, and returns the outputs, valid
-    until the next call. The tensors of ``roots`` live as long as the graph.
+    A call copies the tensors of its arguments in, those on the CPU into page-locked memory, replays
+    the graph, and returns the outputs, valid until the next call. The tensors of ``roots`` live as
+    long as the graph.
     """
 
     IS_STATELESS = True  # its tensors are copies, see :func:`megastep.engine.state_tree.walk`
@@ -173,12 +174,19 @@ class Graph:
         changed: Callable[[], str | None] = lambda: None,
     ):
         leaves, self._spec = _pytree.tree_flatten(args)
-        self._leaves = [leaf.clone() if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]
-        inputs = _pytree.tree_unflatten(self._leaves, self._spec)
         numbered = dict(enumerate(roots))
-        leaves = [*leaves, *state_tree(numbered).values()]
-        devices = [leaf.device for leaf in leaves if isinstance(leaf, torch.Tensor)]
+        tensors = [*leaves, *state_tree(numbered).values()]
+        devices = [leaf.device for leaf in tensors if isinstance(leaf, torch.Tensor)]
         self._device = next((device for device in devices if device.type == "cuda"), None)
+
+        def kept(leaf) -> object:
+            if not isinstance(leaf, torch.Tensor):
+                return leaf
+            is_read_by_gpu = self._device and not leaf.is_cuda
+            return leaf.clone().pin_memory() if is_read_by_gpu else leaf.clone()
+
+        self._leaves = [kept(leaf) for leaf in leaves]
+        inputs = _pytree.tree_unflatten(self._leaves, self._spec)
         with torch.cuda.device(self._device):
             saved, original = snapshot(numbered), _StateBefore(roots)
             try:

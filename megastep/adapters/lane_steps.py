@@ -15,7 +15,7 @@ from megastep.arrdict import arrdict
 from megastep.capture import Graph, capture
 from megastep.dotdict import leaves, mapping
 from megastep.engine.resets import copies
-from megastep.kernels.build.copies import MAX_BYTES, copy_bytes
+from megastep.kernels.build.copies import MAX_BYTES, copy_bytes, either
 from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 
 WORD = 16  # bytes
@@ -24,7 +24,7 @@ BLOCK_BYTES, BLOCK_ROWS = 2**27, 32  # at most, of copies that share memory
 
 def ended(world: World) -> torch.Tensor:
     """Returns (B,) bool: where a world ends an episode."""
-    return world["terminal"] | world["truncated"]
+    return either(world["terminal"], world["truncated"])
 
 
 @torch.inference_mode(False)
@@ -37,51 +37,57 @@ def fresh(tree: Tree) -> Tree:
 class Copies:
     """Copies of a tree of contiguous tensors on a GPU. A kernel, which may be part of a CUDA graph,
     copies all into the next row of a block, whose address and a 0 are in ``row``, (2,) int64. Views
-    are made for a whole block, which they keep, since each takes PyTorch as long as copying.
+    are made for a whole block, which they keep, since each takes PyTorch as long as copying. With
+    ``to_numpy`` blocks are page-locked memory, into which the kernel writes over the bus.
     """
 
-    def __init__(self, tree: Tree, row: torch.Tensor):
-        self._tree, self._leaves, self._row = tree, leaves(tree), row
+    def __init__(self, tree: Tree, row: torch.Tensor, to_numpy: bool):
+        self._tree, self._leaves, self._row, self._to_numpy = tree, leaves(tree), row, to_numpy
         ends = itertools.accumulate(-(-leaf.nbytes // WORD) * WORD for leaf in self._leaves)
         *self._starts, self._row_bytes = 0, *ends
-        self._dtypes = [torch.empty(0, dtype=x.dtype).numpy().dtype for x in self._leaves]
-        self._blank: list[tuple[torch.Tensor, ...]] = []  # the rows that are left, with views
+        self._blank: list[tuple] = []  # views of the rows that are left
         self._is_taken = True  # what the kernel wrote last
 
-    @torch.inference_mode(False)  # they may be called in one, whose tensors stay in it
-    @torch.no_grad()
     def prepare(self, n_rows: int = BLOCK_ROWS) -> None:
         """Call it before the kernel. Makes at most ``n_rows`` rows if there is none."""
         is_ready, self._is_taken = self._blank and self._is_taken, False
         if not is_ready:  # none is left, or a call was interrupted
-            n_rows = min(max(BLOCK_BYTES // self._row_bytes, 1), n_rows)
-            block = self._row.new_empty(n_rows, self._row_bytes, dtype=torch.uint8)
-            views = [
-                block[:, start : start + x.nbytes].view(x.dtype).view(n_rows, *x.shape).unbind()
-                for start, x in zip(self._starts, self._leaves)
-            ]
-            self._blank = [*zip(block.unbind(), *views)][::-1]
-            self._row.zero_()
-            self._row[0].fill_(block.data_ptr())
+            self._blank = self._block(min(max(BLOCK_BYTES // self._row_bytes, 1), n_rows))
+
+    @torch.inference_mode(False)  # they may be called in one, whose tensors stay in it
+    @torch.no_grad()
+    def _block(self, n_rows) -> list[tuple]:
+        if self._to_numpy:  # what an interrupted call has begun to write
+            torch.cuda.current_stream(self._row.device).synchronize()
+        where: dict = dict(pin_memory=True) if self._to_numpy else dict(device=self._row.device)
+        block = torch.empty((n_rows, self._row_bytes), dtype=torch.uint8, **where)
+        views = [
+            block[:, start : start + x.nbytes].view(x.dtype).view(n_rows, *x.shape)
+            for start, x in zip(self._starts, self._leaves)
+        ]
+        self._row.zero_()
+        self._row[0].fill_(block.data_ptr())
+        rows = (view.numpy() if self._to_numpy else view.unbind() for view in views)
+        return [*zip(*rows)][::-1]
 
     def write(self) -> None:
         """Launches the kernel."""
         copy_bytes([*zip(self._starts, self._leaves)], row=self._row, row_bytes=self._row_bytes)
 
-    def take(self, to_numpy: bool = False) -> Tree:
-        """Returns what the kernel wrote last; as arrays, it comes into pinned memory at once."""
-        row, *views = self._blank.pop()
+    def take(self) -> Tree:
+        """Returns what the kernel wrote last, for which it waits if these are arrays."""
+        views = self._blank.pop()
         self._is_taken = True
-        if to_numpy:
-            on_cpu = torch.empty(len(row), dtype=torch.uint8, pin_memory=True)
-            on_cpu.copy_(row, non_blocking=True)
-            torch.cuda.current_stream(row.device).synchronize()
-            views = [
-                on_cpu.numpy()[start : start + x.nbytes].view(dtype).reshape(x.shape)
-                for start, x, dtype in zip(self._starts, self._leaves, self._dtypes)
-            ]
-        rest = iter(views)
-        return mapping(lambda _: next(rest))(self._tree)
+        if self._to_numpy:
+            torch.cuda.current_stream(self._row.device).synchronize()
+        return _unflattened(self._tree, iter(views))
+
+
+def _unflattened(tree, rest) -> Tree:
+    """Returns a tree of dicts with other leaves."""
+    if not isinstance(tree, dict):
+        return next(rest)
+    return {key: _unflattened(value, rest) for key, value in tree.items()}
 
 
 class Lanes:
@@ -92,6 +98,7 @@ class Lanes:
         same_step: begin a new episode in the step that ends one, by a masked reset.
         purpose: what needs masked resets, for the message; None if nothing does.
         parts: what of a step's result, a tree of tensors, ``copies`` has after it on a GPU.
+        to_numpy: whether ``copies`` are arrays.
     """
 
     @torch.inference_mode(False)
@@ -101,17 +108,20 @@ class Lanes:
         same_step: bool = False,
         purpose: str | None = None,
         parts: Callable[[World, World, torch.Tensor], Tree] | None = None,
+        to_numpy: bool = False,
     ):
         self.env, self.n_lanes, self.device = env, n_lanes(env), torch.device(env.device)
         self.roots: tuple = (env,)  # what a step changes
         self._takes_masks = takes_masks(env)
         self._advance = self._same_step if same_step else self._next_step
         self._on_gpu = self.device.type == "cuda" and optional(env, "capturable")
+        self._source = torch.device("cpu") if to_numpy and self._on_gpu else self.device
         self._reset = cast(Callable, env.reset)
         self._step: Callable | None = None
         self._resets: dict[int, Callable] = {}  # by their number of arguments
         self.copies: Copies | None = None
-        self._parts, self._row = parts, torch.empty(2, dtype=torch.int64, device=self.device)
+        self._parts, self._to_numpy = parts, to_numpy
+        self._row = torch.empty(2, dtype=torch.int64, device=self.device)
         if purpose:
             self._require_masks(purpose)
 
@@ -176,7 +186,7 @@ class Lanes:
 
         def converted(space, values) -> torch.Tensor:
             dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
-            values = torch.as_tensor(values).to(self.device, dtype, non_blocking=True)
+            values = torch.as_tensor(values).to(self._source, dtype, non_blocking=True)
             return values.reshape(self.n_lanes, *space.shape).contiguous()
 
         return arrdict(actions=spaces.map(converted, self.env.action_space, actions))
@@ -190,7 +200,7 @@ class Lanes:
             with torch.inference_mode(False), torch.no_grad():
                 decision = self._decision(actions)
                 if self._step is None and self._on_gpu:
-                    self._step = capture(self._with_copies, (decision,), self.roots)
+                    self._step = capture(self._recorded, (decision,), self.roots)
                 if not isinstance(self._step, Graph):
                     return (self._step or self._advance)(decision)
         if self.copies:
@@ -198,13 +208,14 @@ class Lanes:
         with torch.no_grad():  # the graph reads the decision, so inference mode may stay
             return self._step.with_leaves(leaves(self._decision(actions)))
 
-    def _with_copies(self, decision) -> tuple[World, World, torch.Tensor]:
-        stepped = self._advance(decision)
+    def _recorded(self, decision) -> tuple[World, World, torch.Tensor]:
+        there = decision.map(lambda leaf: leaf.to(self.device, non_blocking=True))
+        stepped = self._advance(there)
         if self._parts:
             parts = mapping(torch.Tensor.contiguous)(self._parts(*stepped))
             on_gpu = all(x.is_cuda for x in leaves(parts))
             if on_gpu and sum(x.nbytes for x in leaves(parts)) < MAX_BYTES:
-                self.copies = Copies(parts, self._row)
+                self.copies = Copies(parts, self._row, self._to_numpy)
                 if not torch.cuda.is_current_stream_capturing():
                     self.copies.prepare(1)
                 self.copies.write()

@@ -60,7 +60,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         needs_masks = mode is not AutoresetMode.NEXT_STEP
         purpose = f"autoreset_mode={mode.name}" if needs_masks else None
         parts = self._copied if copy or to_numpy else None
-        self.lanes = Lanes(env, mode is AutoresetMode.SAME_STEP, purpose, parts)
+        self.lanes = Lanes(env, mode is AutoresetMode.SAME_STEP, purpose, parts, to_numpy)
         self.env, self.num_envs, self.device = env, self.lanes.n_lanes, self.lanes.device
         self.autoreset_mode, self.to_numpy, self.copy = mode, to_numpy, copy
         self.dtype = dtype or (torch.float32 if to_numpy else torch.float16)
@@ -156,14 +156,16 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def _arrays(self, stepped) -> dict[str, Tree]:
         copies = self.lanes.copies
-        parts = copies.take(to_numpy=True) if copies else to_numpy(self._copied(*stepped))
+        parts = copies.take() if copies else to_numpy(self._copied(*stepped))
         is_same = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._ended = np.zeros_like(self._ended) if is_same else parts["over"]
         if is_same and parts["over"].any():
-            last = to_numpy(self._cast(self._parts(*stepped))["final_obs"])
-            parts["final_obs"] = np.full(self.num_envs, None, dtype=object)
-            for lane in np.flatnonzero(parts["over"]):
-                parts["final_obs"][lane] = row(last, lane)
+            lanes = np.flatnonzero(parts["over"])
+            rows = torch.as_tensor(lanes, device=self.device)
+            last = as_dtype(row(self._parts(*stepped)["final_obs"], rows), self.dtype)
+            last, parts["final_obs"] = to_numpy(last), np.full(self.num_envs, None, dtype=object)
+            for i, lane in enumerate(lanes):
+                parts["final_obs"][lane] = row(last, i)
         return parts
 
     def _mask(self, world) -> dict[str, Tree]:
@@ -326,6 +328,6 @@ def to_numpy(tree: Tree) -> Tree:
 
 
 @mapping
-def row(leaf: Tree, lane: int | np.integer) -> Tree:
-    """Returns one lane's values of a batch."""
+def row(leaf: Tree, lane: Tree) -> Tree:
+    """Returns one lane's values of a batch, or several lanes'."""
     return leaf[lane]

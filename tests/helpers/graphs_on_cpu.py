@@ -70,8 +70,14 @@ def _record(graph, stream=None, capture_error_mode="global"):
 
 
 class _Stream:
+    def __init__(self, device=None):
+        """It has no state."""
+
     def wait_stream(self, other):
         """Nothing: operations on a CPU run one after the other."""
+
+    def synchronize(self):
+        """Nothing, for the same reason."""
 
 
 def install(monkeypatch, may_wait=False):

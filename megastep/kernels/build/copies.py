@@ -34,6 +34,17 @@ def copy_all(
     copy_bytes(fused, condition)
 
 
+def either(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """Returns (B,) bool: where either of two (B,) bool is true. In a CUDA graph it is quicker than
+    PyTorch's own kernel, which those around it cannot overlap.
+    """
+    if not (one.is_cuda and one.is_contiguous() and other.is_contiguous()):
+        return one | other
+    out = torch.empty_like(one)
+    launch(LIBRARY, "either", one.device, len(one), one=one, other=other, out=out, n=len(one))
+    return out
+
+
 def copy_bytes(
     copies: Sequence[tuple[int, torch.Tensor]],
     condition: torch.Tensor | None = None,

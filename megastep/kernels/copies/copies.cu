@@ -37,3 +37,11 @@ KERNEL copy_all(CopyAllParams p) {
         *p.row += p.row_bytes;
     }
 }
+
+// Where either of two flags is set.
+KERNEL either(EitherParams p) {
+    wait_for_previous();
+    int i = blockIdx.x * BLOCK + threadIdx.x;
+    if (i < p.n)
+        p.out[i] = p.one[i] | p.other[i];
+}

@@ -18,3 +18,10 @@ struct CopyAllParams {
     unsigned int row_bytes;          // by which it moves on afterwards
     int n_copies;
 };
+
+struct EitherParams {
+    const unsigned char* one;    // (n) bool
+    const unsigned char* other;  // (n) bool
+    unsigned char* out;          // (n) bool, out
+    int n;
+};
