@@ -11,13 +11,13 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, SkipValidation
 
+from megastep import spaces
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_teams, score_pairs, teams_of
 from megastep.agents.storage.rollout import copy_tree
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
-from megastep.dotdict import mapping
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import launch
 from megastep.settings import checked
@@ -155,8 +155,12 @@ class Opponents:
         opponent_actions, self.hidden_state = self.mixed_policy.finish(self.acting)
         self.acting = None
         lanes = self.mixed_policy.lanes
-        replace = mapping(lambda leaf, theirs: leaf.index_copy(0, lanes, theirs.to(leaf)))
-        actions = replace(decision["actions"], opponent_actions)
+
+        def replace(_, leaf, theirs) -> torch.Tensor:
+            return leaf.index_copy(0, lanes, theirs.to(leaf))
+
+        space = self.env.action_space
+        actions = spaces.map(replace, space, decision["actions"], opponent_actions)
         world = self.env.step(arrdict(actions=actions))
         self._count_pairs(world)
         return self._observed(world)

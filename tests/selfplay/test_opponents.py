@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves
 
-from megastep import contract, envs, toys
+from megastep import contract, envs, spaces, toys
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs.saver import Saver
@@ -19,6 +19,7 @@ from megastep.agents.storage.rollout import SEQUENCES
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
+from megastep.dotdict import dotdict
 from megastep.env_state import EnvState
 from tests.helpers.games import Always, High, Matrix, Middle
 from tests.helpers.logged import Rows
@@ -152,6 +153,24 @@ def test_snapshots_act_in_their_own_lanes_with_their_own_hidden_state():
     assert (played[:8][theirs[:8]] == 0).all() and (played[8:][theirs[8:]] == 1).all()
     assert env.hidden_state["0"].cell.abs().sum() > 0
     assert len(env.hidden_state["0"].cell) == 8
+
+
+def test_opponents_have_their_own_actions_in_each_part_of_a_dict():
+    class Parts(Matrix):
+        action_space = dotdict(
+            of=dotdict(number=Matrix.action_space, push=spaces.MultiContinuous(1, 2))
+        )
+
+        def step(self, decision):
+            self.pushes = decision.actions.of.push
+            return super().step(arrdict(actions=decision.actions.of.number))
+
+    env = make_opponents(env=Parts(8), past=1.0, bot=0.0)
+    env.reset()
+    parts = arrdict(number=torch.full((16, 1), 2), push=torch.full((16, 1, 2), 0.5))
+    env.step(arrdict(actions=arrdict(of=parts)))
+    assert ((env.env.pushes == 0.5).all((1, 2)) == env.learners).all()
+    assert (env.env.played[-1].flatten()[env.learners] == 2).all()
 
 
 def test_opponents_act_on_a_copy_of_observations():
