@@ -217,14 +217,17 @@ class Run:
         """Returns why a run has no mean return, and how long it has to be for one."""
         trainer = self.training
         n_lanes = trainer.rollout.n_lanes * trainer.ranks.n
-        n_steps = trainer.samples // n_lanes
-        length = f"more than {int(trainer.episodes.stats.totals[1].max())}"
+        n_steps = each = trainer.samples // n_lanes
+        running = int(trainer.episodes.stats.totals[1].max())
+        why = f"an episode has more than {running} steps"
         most = getattr(trainer.env, "limit", None) or optional(trainer.env, "max_episode_steps")
-        if isinstance(most, int) and most < LONGEST:
-            length, n_steps = f"up to {most}", max(n_steps, most)
+        if isinstance(most, int) and each < most < LONGEST:
+            why, n_steps = f"an episode has up to {most} steps", most
+        elif running < each:
+            why = "not all episodes that began before the last report have ended"
         return (  # twice as many, since the first episodes begin at random ages
-            f"no mean return yet: an episode has {length} steps, and each of {n_lanes} lanes took "
-            f"{trainer.samples // n_lanes}; give samples={2 * n_steps * n_lanes}, or more seconds="
+            f"no mean return yet: {why}, and each of {n_lanes} lanes took {each}; give "
+            f"samples={2 * n_steps * n_lanes}, or more seconds="
         )
 
 

@@ -201,11 +201,18 @@ def test_resume_after_a_signal(here, monkeypatch, capsys):
     assert checkpoint.load_latest(here / "r n ü" / "checkpoints").step == 3 * UPDATE
 
 
-def test_a_run_too_short_for_an_episode_says_how_long_one_is(here, capsys):
-    words = [*TINY, "samples=32", "env.shortest=50", "env.longest=50", "desync=false"]
-    assert train.main([*words, "folder=run"]) == 0
-    text = "no mean return yet: an episode has more than 8 steps, and each of 4 lanes took 8; give "
-    assert f"{text}samples=64, or more seconds=" in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("length", "why"),
+    [
+        (50, "an episode has more than 8 steps"),
+        (5, "not all episodes that began before the last report have ended"),
+    ],
+)
+def test_a_run_too_short_for_a_mean_says_why(length, why, here, capsys):
+    lengths = f"env.shortest={length}", f"env.longest={length}", "desync=false"
+    assert train.main([*TINY, "samples=32", *lengths, "folder=run"]) == 0
+    text = f"no mean return yet: {why}, and each of 4 lanes took 8; give samples=64, or more "
+    assert text in capsys.readouterr().out
 
 
 def test_a_run_ends_with_its_result_and_the_next_command(here, capsys):
