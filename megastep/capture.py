@@ -175,18 +175,12 @@ class Graph:
     ):
         leaves, self._spec = _pytree.tree_flatten(args)
         numbered = dict(enumerate(roots))
-        tensors = [*leaves, *state_tree(numbered).values()]
-        devices = [leaf.device for leaf in tensors if isinstance(leaf, torch.Tensor)]
-        self._device = next((device for device in devices if device.type == "cuda"), None)
-
-        def kept(leaf) -> object:
-            if not isinstance(leaf, torch.Tensor):
-                return leaf
-            is_read_by_gpu = self._device and not leaf.is_cuda
-            return leaf.clone().pin_memory() if is_read_by_gpu else leaf.clone()
-
-        self._leaves = [kept(leaf) for leaf in leaves]
-        inputs = _pytree.tree_unflatten(self._leaves, self._spec)
+        tensors = [x for x in (*leaves, *state_tree(numbered).values()) if torch.is_tensor(x)]
+        self._device = next((x.device for x in tensors if x.device.type == "cuda"), None)
+        leaves = [leaf.clone() if torch.is_tensor(leaf) else leaf for leaf in leaves]
+        if self._device:  # which reads page-locked memory itself
+            leaves = [x if getattr(x, "is_cuda", True) else x.pin_memory() for x in leaves]
+        self._leaves, inputs = leaves, _pytree.tree_unflatten(leaves, self._spec)
         with torch.cuda.device(self._device):
             saved, original = snapshot(numbered), _StateBefore(roots)
             try:

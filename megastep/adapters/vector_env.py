@@ -133,15 +133,12 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return parts
 
     def _copied(self, world, final, over) -> dict[str, Tree]:
-        """Returns parts as they are given away; arrays of last observations when there are any."""
-        parts = self._cast(self._parts(world, final, over))
-        if self.to_numpy:
-            parts.pop("final_obs", None)
-        return parts
+        """Returns parts as they are given away; arrays of last observations are cast later."""
+        return self._cast(self._parts(world, final, over))
 
     def _cast(self, parts) -> dict[str, Tree]:
         """Returns parts with floats of observations in the dtype."""
-        names = [name for name in ("obs", "final_obs") if name in parts]
+        names = {"obs"} if self.to_numpy else {"obs", "final_obs"} & parts.keys()
         return parts | {name: as_dtype(parts[name], self.dtype) for name in names}
 
     def _tensors(self, stepped) -> dict[str, Tree]:
@@ -160,12 +157,14 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         is_same = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._ended = np.zeros_like(self._ended) if is_same else parts["over"]
         if is_same and parts["over"].any():
-            lanes = np.flatnonzero(parts["over"])
-            rows = torch.as_tensor(lanes, device=self.device)
-            last = as_dtype(row(self._parts(*stepped)["final_obs"], rows), self.dtype)
-            last, parts["final_obs"] = to_numpy(last), np.full(self.num_envs, None, dtype=object)
-            for i, lane in enumerate(lanes):
-                parts["final_obs"][lane] = row(last, i)
+            last, parts["final_obs"] = (
+                parts["final_obs"],
+                np.full(self.num_envs, None, dtype=object),
+            )
+            kind = NUMPY[self.dtype]
+            cast = mapping(lambda leaf: leaf.astype(kind if leaf.dtype.kind == "f" else leaf.dtype))
+            for lane in np.flatnonzero(parts["over"]):
+                parts["final_obs"][lane] = cast(row(last, lane))
         return parts
 
     def _mask(self, world) -> dict[str, Tree]:
@@ -328,6 +327,6 @@ def to_numpy(tree: Tree) -> Tree:
 
 
 @mapping
-def row(leaf: Tree, lane: Tree) -> Tree:
-    """Returns one lane's values of a batch, or several lanes'."""
+def row(leaf: Tree, lane: int | np.integer) -> Tree:
+    """Returns one lane's values of a batch."""
     return leaf[lane]
