@@ -158,9 +158,8 @@ def end_failed_recording() -> None:
 class Graph:
     """A function recorded as a CUDA graph. Arguments are those of :func:`capture`.
 
-    A call copies the tensors of its arguments in, those on the CPU into page-locked memory, replays
-    the graph, and returns the outputs, valid until the next call. The tensors of ``roots`` live as
-    long as the graph.
+    A call copies the tensors of its arguments in, on the CPU into page-locked memory, replays it,
+    and returns the outputs, valid until the next call. The tensors of ``roots`` live as long as it.
     """
 
     IS_STATELESS = True  # its tensors are copies, see :func:`megastep.engine.state_tree.walk`
