@@ -15,7 +15,9 @@ from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.gradient_steps import one
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalise
-from megastep.agents.networks.fused import fused
+from megastep.agents.networks.fused import aligned, fused
+from megastep.agents.networks.heads import MultiDiscreteOutput
+from megastep.agents.networks.linear import cast, gradient_of_weights, sum_rows
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import add_moments, masked_moments, normalise_masked
 from megastep.agents.storage.rollout import SEQUENCES, without_last
@@ -24,9 +26,25 @@ from megastep.coefficients import on_device
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.settings import checked
 
+_ROWS, _THREADS = LIBRARY.constants["JOINT_ROWS"], LIBRARY.constants["JOINT_THREADS"]
+_N_SUMS = LIBRARY.constants["N_JOINT_SUMS"]
 _PARTS = "starts", "actions", "logprobs", "mask"  # of a rollout, that a minibatch copies
 _COEFFICIENTS = "clip", "value_coef", "entropy_coef", "auxiliary_coef"
 _METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
+
+
+def _fields(batch, value_scale, coefficients) -> dict:
+    """Returns what kernels take of a minibatch and of the loss's settings."""
+    numbers, device = dict(coefficients), value_scale.device
+    value_clip = numbers.pop("value_clip")
+    tensors = dict(old_logprobs=batch.logprobs, advantages=batch.advantages)
+    tensors |= dict(targets=batch.targets, valid=batch.valid)
+    tensors["old_values"] = None if value_clip is None else batch.old_value
+    return dict(
+        {name: None if x is None else x.contiguous() for name, x in tensors.items()},
+        **{name: on_device(number, device) for name, number in numbers.items()},
+        **dict(n_valid=batch.n_valid, value_scale=value_scale, value_clip=value_clip or 0.0),
+    )
 
 
 class _Loss(torch.autograd.Function):
@@ -34,23 +52,17 @@ class _Loss(torch.autograd.Function):
     def forward(
         ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        numbers = dict(coefficients)
-        value_clip, device = numbers.pop("value_clip"), logprobs.device
         inputs = dict(logprobs=logprobs, entropies=entropies, values=values, errors=errors)
-        inputs |= dict(old_logprobs=batch.logprobs, advantages=batch.advantages)
-        inputs |= dict(targets=batch.targets, valid=batch.valid)
-        inputs["old_values"] = None if value_clip is None else batch.old_value
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
         n_rows, blocks = logprobs.numel(), Blocks(-(-logprobs.numel() // BLOCK))
         sums = logprobs.new_empty(blocks.x, LIBRARY.constants["N_SUMS"])
         launch(
-            *(LIBRARY, "ppo_loss", device, blocks),
+            *(LIBRARY, "ppo_loss", logprobs.device, blocks),
             **{name: None if x is None else x.contiguous() for name, x in inputs.items()},
             **{**dict.fromkeys(names), **dict(zip(names, gradients))},
-            **{name: on_device(number, device) for name, number in numbers.items()},
-            **dict(n_valid=batch.n_valid, value_scale=value_scale, sums=sums, n_rows=n_rows),
-            value_clip=value_clip or 0.0,
+            **_fields(batch, value_scale, coefficients),
+            **dict(sums=sums, n_rows=n_rows),
         )
         ctx.save_for_backward(*gradients)
         means = sums.sum(0)
@@ -65,6 +77,66 @@ class _Loss(torch.autograd.Function):
         if d_loss.data_ptr() != one(d_loss.device).data_ptr():
             gradients = torch._foreach_mul(gradients, d_loss)  # pyright: ignore[reportPrivateImportUsage]
         return *gradients, *[None] * (7 - len(gradients))
+
+
+class _JointLoss(torch.autograd.Function):
+    """The heads of a plain critic and of few actions, and the loss, with all gradients."""
+
+    @staticmethod
+    def forward(
+        ctx, batch, output, coefficients, features, *parameters
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        features = aligned(features.flatten(0, -2))
+        heads = [cast(leaf, features.dtype, multiple=8) for leaf in parameters]
+        n_rows, width = features.shape
+        d_features, d_columns = torch.empty_like(features), features.new_empty(n_rows, 16)
+        names = "weight", "bias", "value_weight", "value_bias"
+        blocks = Blocks(-(-n_rows // _ROWS), 1, _THREADS, 32 * (width + 2))
+        sums = features.new_empty(blocks.x, _N_SUMS, dtype=torch.float32)
+        launch(
+            *(LIBRARY, "joint_loss", features.device, blocks),
+            **dict(zip(names, map(aligned, heads)), actions=batch.actions.long().contiguous()),
+            **dict(features=features, d_features=d_features, d_columns=d_columns, sums=sums),
+            **_fields(batch, output.scale, coefficients),
+            **dict(value_mean=output.mean, n_rows=n_rows),
+            **dict(width=width, n_choices=len(parameters[0])),
+        )
+        sums = sum_rows(sums)
+        ctx.save_for_backward(features, d_features, d_columns, sums)
+        ctx.lead, ctx.n_choices = batch.valid.shape, len(parameters[0])
+        metrics, loss = sums[: len(_METRICS)], sums[len(_METRICS)]
+        ctx.mark_non_differentiable(metrics)
+        return loss, metrics
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_loss, d_metrics) -> tuple[torch.Tensor | None, ...]:
+        features, d_features, d_columns, sums = ctx.saved_tensors
+        if d_loss.data_ptr() != one(d_loss.device).data_ptr():
+            d_features, d_columns, sums = (
+                x * d_loss.to(x.dtype) for x in (d_features, d_columns, sums)
+            )
+        d_weight, d_bias = gradient_of_weights(d_columns, features), sums[len(_METRICS) + 1 :]
+        n, d_features = ctx.n_choices, d_features.unflatten(0, ctx.lead)
+        return None, None, None, d_features, d_weight[:n], d_bias[:n], d_weight[8:9], d_bias[8:9]
+
+
+def _joint_loss(policy, batch, coefficients, has_errors, obs, privileged, lanes) -> tuple:
+    starts, output = without_last(batch.starts), policy.critic.output
+    with policy.compute_dtype():
+        features, _ = policy._features(obs, starts, batch.state, lanes)
+        parameters = *policy.output.linear.parameters(), *output.linear.parameters()
+        features = features.to(torch.bfloat16)
+        loss, means = _JointLoss.apply(batch, output, coefficients, features, *parameters)
+    return loss, dict(zip(_METRICS[:-1], means.unbind())), features
+
+
+def _takes_joint_loss(policy, batch, coefficients, has_errors, *_) -> bool:
+    output, is_plain = policy.output, has_errors and not policy.critic.is_asymmetric
+    is_few = type(output) is MultiDiscreteOutput and output.shape[0] == 1 and output.shape[1] <= 8
+    is_known = is_plain and is_few and type(policy).terms is Policy.terms and "mask" not in batch
+    is_bf16 = policy.bf16 and policy.device.type == "cuda" and not policy.width % 32
+    return is_known and is_bf16 and torch.cuda.get_device_capability(policy.device) >= (8, 0)
 
 
 def _loss_on_gpu(**inputs) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -124,6 +196,17 @@ def ppo_loss(
         metrics["auxiliary"] = masked_mean(errors, valid)
         loss = loss + coefficients["auxiliary_coef"] * metrics["auxiliary"]
     return loss, metrics
+
+
+@fused(_joint_loss, _takes_joint_loss)
+def _loss_of(policy, batch, coefficients, has_errors, obs, privileged, lanes) -> tuple:
+    """Returns the loss of a minibatch, its metrics, and the features that it learns from."""
+    options = dict(has_errors=has_errors, mask=without_last(batch.get("mask")))
+    sequence = obs, without_last(batch.starts), batch.state, batch.actions
+    terms = policy.terms(*sequence, privileged, lanes, **options)
+    features, scale = terms.pop("features"), policy.critic.output.scale
+    loss = ppo_loss(**terms, batch=batch, value_scale=scale, coefficients=coefficients)
+    return *loss, features
 
 
 class PPO(learner.ActorCritic):
@@ -202,21 +285,13 @@ class PPO(learner.ActorCritic):
 
     def _losses(self, rollout, lanes, batch) -> "tuple[torch.Tensor, dict[str, torch.Tensor]]":
         """Returns the loss of a minibatch and its metrics, (); `batch` has its other parts."""
-        policy, privileged = self.policy, without_last(rollout.privileged)
-        starts = without_last(batch.starts)
-        sequence = without_last(rollout.obs), starts, batch.state, batch.actions
-        options = dict(has_errors=not self.has_extra_loss, mask=without_last(batch.get("mask")))
-        terms = policy.terms(*sequence, privileged, lanes, **options)
-        features = terms.pop("features")
-        numbers = {name: self.coefficients[name] for name in _COEFFICIENTS}
-        loss, metrics = ppo_loss(
-            **terms,
-            batch=batch,
-            value_scale=self.critic.output.scale,
-            coefficients=numbers | {"value_clip": self.value_clip},
-        )
+        numbers: dict = {name: self.coefficients[name] for name in _COEFFICIENTS}
+        numbers["value_clip"] = self.value_clip
+        seen = without_last(rollout.obs), without_last(rollout.privileged), lanes
+        inputs = self.policy, batch, numbers, not self.has_extra_loss
+        loss, metrics, features = _loss_of(*inputs, *seen)
         if self.has_extra_loss:  # which has that of the privileged observations, too
-            with policy.compute_dtype():
+            with self.policy.compute_dtype():
                 extra, own = self.extra_terms(features, batch, metrics)
             loss, metrics = loss + extra, metrics | own
         return loss, metrics

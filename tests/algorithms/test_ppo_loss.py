@@ -3,8 +3,12 @@
 import pytest
 import torch
 
+from megastep import spaces
+from megastep.agents.algorithms import ppo as ppo_module
 from megastep.agents.algorithms import returns
 from megastep.agents.algorithms.ppo import ppo_loss
+from megastep.agents.networks import heads
+from megastep.agents.networks.critic import ValueOutput
 from megastep.arrdict import arrdict
 
 T, M = 7, 133
@@ -94,3 +98,45 @@ def test_gae_on_a_gpu_takes_other_layouts_and_float64(change, to_gpu):
         torch.testing.assert_close(
             other[name].cpu().to(leaf.dtype), leaf, rtol=1e-5, atol=1e-5, check_stride=False
         )
+
+
+def rounded(x):
+    return x + (x.bfloat16().float() - x).detach()
+
+
+@pytest.mark.parametrize("sizes", [(7, 64, None), (8, 96, 0.3), (2, 256, None)], ids=str)
+def test_joint_loss_matches_heads_and_loss(sizes, to_gpu, monkeypatch):
+    """Losses and gradients of features and parameters, from features rounded to bfloat16."""
+    torch.manual_seed(0)
+    if not torch.cuda.is_available():  # a CPU has no product of bfloat16 with a float32 result
+        monkeypatch.setattr(ppo_module, "gradient_of_weights", lambda d, x: d.float().T @ x.float())
+    n_choices, width, value_clip = sizes
+    output = heads.output(spaces.MultiDiscrete(1, n_choices), width)
+    critic = ValueOutput(width)
+    for leaf in (*output.parameters(), *critic.parameters()):
+        leaf.data = (0.1 * torch.randn(leaf.shape)).bfloat16().float()
+    critic.mean.fill_(-0.5), critic.scale.fill_(2.5)
+    features = torch.randn(T, M, width).bfloat16()
+    _, batch, scale, settings = case(torch.Tensor.cpu, value_clip, False)
+    batch["actions"] = torch.randint(n_choices, (T, M, 1))
+    results = []
+    for to in (to_gpu, torch.Tensor.cpu):
+        parameters = [*output.linear.parameters(), *critic.linear.parameters()]
+        parameters = [to(leaf.detach().clone()).requires_grad_() for leaf in parameters]
+        x = to(features if to is to_gpu else features.float()).requires_grad_()
+        if to is to_gpu:
+            numbers = arrdict(scale=to(critic.scale), mean=to(critic.mean))
+            inputs = batch.map(to), numbers, settings, x, *parameters
+            loss, means = ppo_module._JointLoss.apply(*inputs)
+        else:
+            weight, bias, of_value, bias_of_value = parameters
+            logits = rounded(x @ weight.T + bias)[:, :, None].log_softmax(-1)
+            values = rounded(x @ of_value.T + bias_of_value)[..., 0]
+            values = values * critic.scale + critic.mean
+            terms = output.logprob(logits, batch.actions), output.entropy(logits), values, None
+            loss, metrics = loss_of(terms, batch, critic.scale, settings)
+            means = torch.stack([*metrics.values()])
+        results.append([loss, means[:5], *torch.autograd.grad(3 * loss, [x, *parameters])])
+    for i, (fused, plain) in enumerate(zip(*results, strict=True)):
+        error = (fused.detach().float().cpu() - plain).norm() / plain.norm()
+        assert error < 2.5e-2, (i, error)  # 8 bits

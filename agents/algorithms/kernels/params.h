@@ -10,9 +10,12 @@ constexpr int CHECKED_TENSORS = 16;   // of a rollout
 constexpr int CHECKED_THREADS = 256;  // of a block
 constexpr int CHECKED_WORDS = 4;      // of 16 bytes, that a thread reads
 constexpr int RECORD_THREADS = 1024;
-constexpr int N_SUMS = 7;        // of PPO's loss: see PpoLossParams
-constexpr int TD_THREADS = 256;  // of a block
-constexpr int TD_SEQUENCES = 8;  // of a block, whose numbers fill a sector of 32 bytes
+constexpr int N_SUMS = 7;           // of PPO's loss: see PpoParams
+constexpr int N_JOINT_SUMS = 16;    // with gradients of nine biases
+constexpr int JOINT_ROWS = 128;     // of a block
+constexpr int JOINT_THREADS = 256;  // of a block
+constexpr int TD_THREADS = 256;     // of a block
+constexpr int TD_SEQUENCES = 8;     // of a block, whose numbers fill a sector of 32 bytes
 constexpr int N_TD_SUMS = 7;
 constexpr int N_TD_METRICS = 7;
 
@@ -42,31 +45,49 @@ struct VtraceParams : ReturnsParams {
     const float* c_clip;     // ()
 };
 
-struct PpoLossParams {
-    const float* logprobs;       // (n_rows), of the actions
-    const float* entropies;      // (n_rows)
-    const float* values;         // (n_rows)
-    const float* errors;         // (n_rows), of the prediction; null: there is none
-    const float* old_logprobs;   // (n_rows), when acting
-    const float* old_values;     // (n_rows), when acting; null: values are not clipped
-    const float* advantages;     // (n_rows)
-    const float* targets;        // (n_rows)
-    const unsigned char* valid;  // (n_rows)
-    const long long* n_valid;    // ()
-    const float* value_scale;    // ()
-    float* d_logprobs;           // (n_rows), gradients of the loss
-    float* d_entropies;          // (n_rows)
-    float* d_values;             // (n_rows)
-    float* d_errors;             // (n_rows)
-    // (n_blocks, N_SUMS), shares of means: policy, value, entropy, kl, clip_fraction, auxiliary,
-    // loss
-    float* sums;
+struct PpoParams {
+    const float* old_logprobs;    // (n_rows), when acting
+    const float* old_values;      // (n_rows), when acting; null: values are not clipped
+    const float* advantages;      // (n_rows)
+    const float* targets;         // (n_rows)
+    const unsigned char* valid;   // (n_rows)
+    const long long* n_valid;     // ()
+    const float* value_scale;     // ()
     const float* clip;            // ()
     const float* value_coef;      // ()
     const float* entropy_coef;    // ()
     const float* auxiliary_coef;  // ()
+    // (n_blocks, N_SUMS), shares of means: policy, value, entropy, kl, clip_fraction, auxiliary,
+    // loss; of joint_loss (n_blocks, N_JOINT_SUMS), then gradients of biases
+    float* sums;
     int n_rows;
     float value_clip;
+};
+
+struct PpoLossParams : PpoParams {
+    const float* logprobs;   // (n_rows), of the actions
+    const float* entropies;  // (n_rows)
+    const float* values;     // (n_rows)
+    const float* errors;     // (n_rows), of the prediction; null: there is none
+    float* d_logprobs;       // (n_rows), gradients of the loss
+    float* d_entropies;      // (n_rows)
+    float* d_values;         // (n_rows)
+    float* d_errors;         // (n_rows)
+};
+
+// W features, n choices, at most eight. Weights and biases have rows of zeros up to eight.
+struct JointLossParams : PpoParams {
+    const void* features;      // (n_rows, W) bfloat16
+    const void* weight;        // (8, W) bfloat16, of the scores
+    const void* bias;          // (8) bfloat16
+    const void* value_weight;  // (8, W) bfloat16
+    const void* value_bias;    // (8) bfloat16
+    const float* value_mean;   // ()
+    const long long* actions;  // (n_rows)
+    void* d_features;          // (n_rows, W) bfloat16
+    void* d_columns;           // (n_rows, 16) bfloat16, of the scores and the value
+    int width;                 // W, a multiple of 32
+    int n_choices;             // n
 };
 
 // M sequences of T steps after the burn-in, A agents per lane, n choices.
