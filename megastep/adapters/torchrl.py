@@ -39,7 +39,8 @@ class TorchRLEnv(EnvBase):
         if self._is_masked:
             mask = without_agents(env.action_space, world["mask"])
             self.observation_spec["action_mask"] = _mask_spec(mask, n, on)
-        self.action_spec = _spec(env.action_space, n, torch.float32, on)
+        action = _spec(env.action_space, n, torch.float32, on)
+        self.full_action_spec = Composite({"action": action}, shape=[n], **on)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32, **on)
         flag = torch.empty(n, 1, dtype=torch.bool)
         flags = dict.fromkeys(("done", "terminated", "truncated"), flag)

@@ -17,7 +17,8 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from megastep import adapters, arrdict, contract, envs, geometries
+from megastep import adapters, arrdict, contract, dotdict, envs, geometries, spaces
+from megastep.wrappers import Wrapper
 from tests.helpers.made_up import Numbers
 from tests.helpers.synchronisation import no_synchronisation
 
@@ -318,12 +319,26 @@ def test_torchrl_acts_by_the_mask():
 # ---- TorchRL, Stable-Baselines3, rsl_rl ----
 
 
+class Parts(Wrapper):
+    """Takes a dict of actions, of which one counts."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = dotdict.dotdict(
+            move=env.action_space, spare=spaces.MultiContinuous(1, 2)
+        )
+
+    def before(self, actions):
+        return actions["move"]
+
+
 @pytest.mark.parametrize(
     "make",
     (
         pong,
         lambda: pointgoal(privileged=True),
         lambda: envs.PointGoal(3, HOMES, limit=20, control="continuous", device="cpu"),
+        lambda: Parts(pong()),
     ),
 )
 def test_torchrl(make):
@@ -334,9 +349,12 @@ def test_torchrl(make):
     rollout = env.rollout(60, break_when_any_done=False)
     world = twin.reset(seed=5 + torch.arange(contract.n_lanes(twin)))
     for t in range(60):  # partial resets begin the next episode where one ended, and leave others
-        action = rollout["action"][:, t].reshape(len(world.reward), *twin.action_space.shape)
-        action = action.contiguous()
-        world = twin.step(arrdict.arrdict(actions=action))
+
+        def one(space, leaf, t=t) -> torch.Tensor:
+            return leaf[:, t].reshape(-1, *space.shape).contiguous()
+
+        actions = spaces.map(one, twin.action_space, rollout["action"])
+        world = twin.step(arrdict.arrdict(actions=actions))
         assert torch.equal(rollout["next", "reward"][:, t, 0], world.reward)
         assert torch.equal(rollout["next", "truncated"][:, t, 0], world.truncated)
         world = twin.reset(mask=world.terminal | world.truncated)
