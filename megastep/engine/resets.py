@@ -7,7 +7,7 @@ import torch
 from torch.utils import _pytree
 
 from megastep.engine import checks
-from megastep.engine.state_tree import is_expanded, walk
+from megastep.engine.state_tree import is_expanded, rebind, walk
 from megastep.kernels.build.copies import copy_all
 from megastep.read_only import ReadOnlyTensor
 from megastep.types import n_lanes
@@ -95,28 +95,33 @@ class Resets:
             return world
         chosen = chosen.clone()  # it may be a part of what changes
         rows, leaves = [*self._rows(env)], _pytree.tree_leaves(world)
-        before = copies([*(leaf for leaf, _ in rows), *leaves])
+        before = copies([*(leaf for _, leaf, _ in rows), *leaves])
         new = begin(chosen)
         began, fresh = new["reset"].clone(), _pytree.tree_leaves(new)
         # in place, so that a CUDA graph that steps and one that resets share the world
-        parts = [(*row, row[0]) for row in rows]
+        parts, now = [], walk(env, torch.Tensor)
+        for path, leaf, axis in rows:
+            parent, step, own = now.get(path, (None, "", leaf))
+            parts.append((leaf, axis, leaf if own is leaf else own.clone()))
+            if own is not leaf:  # replaced, as by `self.age = self.age + 1`
+                rebind(parent, step, leaf)
         parts += [(leaf, 0, own) for leaf, own in zip(leaves, fresh, strict=True)]
         for (leaf, axis, own), old in zip(parts, before, strict=True):
             torch.where(_along(began, env.n_envs, leaf, axis), own, old, out=leaf)
         return world
 
-    def _rows(self, env) -> Iterable[tuple[torch.Tensor, int]]:
-        """Yields (tensor, axis of the lanes or environments) of what an episode may change."""
+    def _rows(self, env) -> Iterable[tuple[str, torch.Tensor, int]]:
+        """Yields (path, tensor, axis of lanes or environments) of what an episode may change."""
         sizes = env.n_envs, n_lanes(env)
         for path, (_, step, leaf) in walk(env, torch.Tensor).items():
             if isinstance(leaf, ReadOnlyTensor) or is_expanded(leaf) or not leaf.ndim:
                 continue
             if path.removeprefix(".") in self.lanes_last:
-                yield leaf, -1
+                yield path, leaf, -1
             elif len(leaf) in sizes:
-                yield leaf, 0
+                yield path, leaf, 0
             elif step[1:] in PER_DRAW and len(leaf) and len(leaf) % env.n_envs == 0:
-                yield leaf, 0
+                yield path, leaf, 0
 
     def _seed(self, env, seed, chosen) -> None:
         seeds = torch.empty_like(chosen, dtype=torch.int64)

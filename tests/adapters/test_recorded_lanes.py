@@ -63,8 +63,37 @@ def recorded(same_step, monkeypatch):
     return lanes
 
 
-def test_the_environment_keeps_the_contract():
-    contract.rollout(Sums(), 20)
+class Replaces(Sums):
+    """Replaces its tensors in each step, those of a dict with the dict."""
+
+    def __init__(self):
+        super().__init__()
+        self.state = {"sums": self.sums}
+
+    def world(self, actions):
+        self.ages, self.counts, self.ended = self.ages + 0, self.counts + 0, self.ended.clone()
+        self.sums = self.state["sums"].clone()
+        self.state = {"sums": self.sums}
+        return super().world(actions)
+
+
+@pytest.mark.parametrize("kind", (Sums, Replaces))
+def test_the_environment_keeps_the_contract(kind):
+    contract.rollout(kind(), 20)
+
+
+@pytest.mark.parametrize("same_step", (False, True))
+def test_lanes_that_do_not_begin_keep_state_that_is_replaced(same_step):
+    lanes, others = Lanes(Sums(), same_step), Lanes(Replaces(), same_step)
+    generator = torch.Generator().manual_seed(1)
+    lanes.reset(3)
+    others.reset(3)
+    for _ in range(40):
+        actions = torch.randint(3, (N,), generator=generator)
+        for one, other in zip(lanes.step(actions), others.step(actions), strict=True):
+            assert contract.same({"": one}, {"": other})
+        mask = torch.rand(N, generator=generator) < 0.2
+        assert contract.same(lanes.reset(mask=mask), others.reset(mask=mask))
 
 
 @pytest.mark.parametrize("same_step", (False, True))
