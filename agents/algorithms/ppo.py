@@ -15,6 +15,7 @@ from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.gradient_steps import one
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalise
+from megastep.agents.networks.beside import now, second_stream
 from megastep.agents.networks.fused import aligned, fused
 from megastep.agents.networks.heads import MultiDiscreteOutput
 from megastep.agents.networks.linear import cast, gradient_of_weights, sum_rows
@@ -52,6 +53,7 @@ class _Loss(torch.autograd.Function):
     def forward(
         ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients
     ) -> tuple[torch.Tensor, torch.Tensor]:
+        ctx.set_materialize_grads(False)
         inputs = dict(logprobs=logprobs, entropies=entropies, values=values, errors=errors)
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
@@ -244,6 +246,8 @@ class PPO(learner.ActorCritic):
         self.normalise_advantage = normalise_advantage
 
     def _update(self, rollout) -> "dict[str, torch.Tensor]":
+        with second_stream(self.device, now(self.device)) as join:
+            first = self.minibatches(rollout.n_lanes)
         transitions = rollout.transitions()
         numbers = {name: self.coefficients[name] for name in ("gamma", "lambda_")}
         estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **numbers)
@@ -263,9 +267,10 @@ class PPO(learner.ActorCritic):
             estimates["old_value"] = transitions["value"]
         estimates["n_valid"] = valid.sum(0, keepdim=True)  # of each lane
 
+        join()
         is_enabled = True
-        for _ in range(self.n_epochs):
-            for lanes in self.minibatches(rollout.n_lanes):
+        for epoch in range(self.n_epochs):
+            for lanes in self.minibatches(rollout.n_lanes) if epoch else first:
                 parts = SEQUENCES if self.has_extra_loss else _PARTS
                 batch = rollout.sequences(lanes, parts, estimates)
                 batch["n_valid"] = batch.pop("n_valid").sum()

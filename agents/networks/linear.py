@@ -297,15 +297,15 @@ def gradient_of_inputs(
     d: torch.Tensor, weight: torch.Tensor, addend: torch.Tensor | None = None
 ) -> torch.Tensor:
     """Returns the gradient (..., K) of a layer's inputs from that of its outputs (..., M) and its
-    weight (M, K), plus a contiguous addend (..., K).
+    weight (M, K), plus a contiguous addend (..., K), in whose place it is.
     """
     rows = d.flatten(0, -2)
     flat = None if addend is None else addend.flatten(0, -2)
     addends = () if flat is None else (flat,)
     if few_rows.fits(rows, weight, *addends) and all(x.is_contiguous() for x in addends):
-        result = few_rows.multiply(rows, weight, addend=flat, of_inputs=True)
+        result = few_rows.multiply(rows, weight, addend=flat, out=flat, of_inputs=True)
     else:
-        result = rows @ weight if flat is None else torch.addmm(flat, rows, weight)
+        result = rows @ weight if flat is None else flat.addmm_(rows, weight)
     return result.unflatten(0, d.shape[:-1])
 
 

@@ -17,7 +17,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from megastep.agents.networks import step
+from megastep.agents.networks import beside, step
 from megastep.agents.networks.fused import (
     LIBRARY,
     aligned,
@@ -67,8 +67,8 @@ def _fits(x, *_) -> bool:
 
 # `_forward_...` returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output
 # without a residual and the last cell, (B, W) float32, and what `_backward_...` needs. That returns
-# the gradients of the gates (T, B, 4 W), of the bias (4 W,), of the output and the cell before the
-# sequence, (B, W), and of the inputs, None if left to the caller.
+# the gradients of the gates (T, B, 4 W), of the bias in rows to be added up (..., 4 W), of the
+# output and the cell before the sequence, (B, W), and of the inputs, None if left to the caller.
 
 # ---- On a GPU with clusters of blocks: the recurrent weights stay on the chip ----
 
@@ -86,17 +86,24 @@ def _forward_on_clusters(
 ) -> tuple:
     gates, (n_steps, n_lanes, width) = product(x, input_weight, bias), x.shape
     outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
-    last_output, last_cell, saved = torch.empty_like(output), torch.empty_like(cell), (None, None)
+    last_output, last_cell, saved = torch.empty_like(output), torch.empty_like(cell), [None, None]
     if saves:
         lead = n_steps, -(-n_lanes // _LANES), width // _BLOCK_UNITS, _LANES // 8, _THREADS
-        saved = gates.new_empty(*lead, 8), cell.new_empty(*lead, 2)
-    _launch_clusters(
-        *("forward", width, x.device, n_lanes),
-        **dict(gates=gates, weight=weight, reset=reset, residual=residual),
-        **dict(last_output=output, last_cell=cell, output=last_output, cell=last_cell),
-        **dict(outputs=outputs, hiddens=hiddens, saved_gates=saved[0], saved_cells=saved[1]),
-        n_steps=n_steps,
-    )
+        saved = [gates.new_empty(*lead, 8), cell.new_empty(*lead, 2)]
+    work = beside.waiting()
+    event = None if work is None else beside.now(x.device)
+    with beside.second_stream(x.device, event) as join:
+        _launch_clusters(
+            *("forward", width, x.device, n_lanes),
+            **dict(gates=gates, weight=weight, reset=reset, residual=residual),
+            **dict(last_output=output, last_cell=cell, output=last_output, cell=last_cell),
+            **dict(outputs=outputs, hiddens=hiddens, saved_gates=saved[0], saved_cells=saved[1]),
+            n_steps=n_steps,
+        )
+    if work is not None:
+        work()
+    saved.append(weight.T.contiguous() if saves else None)
+    join()
     return outputs, hiddens, last_output, last_cell, saved
 
 
@@ -107,13 +114,13 @@ def _backward_on_clusters(input_weight, weight, reset, saved, d_outputs, d_cell)
     d_last_output, d_last_cell = (saved[1].new_empty(n_lanes, width) for _ in range(2))
     _launch_clusters(
         *("backward", width, weight.device, n_lanes),
-        **dict(weight=weight.T.contiguous(), reset=reset),
+        **dict(weight=saved[2], reset=reset),
         **dict(saved_gates=saved[0], saved_cells=saved[1], d_outputs=d_outputs, d_cell=d_cell),
         **dict(d_gates=d_gates, d_bias=d_bias),
         **dict(d_last_output=d_last_output, d_last_cell=d_last_cell),
         n_steps=n_steps,
     )
-    return d_gates, sum_rows(d_bias), d_last_output, d_last_cell, None
+    return d_gates, d_bias, d_last_output, d_last_cell, None
 
 
 # ---- On a CPU ----
@@ -146,7 +153,7 @@ def _backward_on_cpu(input_weight, weight, reset, saved, d_outputs, d_cell) -> t
         **dict(d_output=d_first_output, d_cell=d_first_cell),
         **dict(n_steps=n_steps, n_lanes=n_lanes, width=width, n_threads=threads()),
     )
-    return d_gates, d_gates.flatten(0, 1).sum(0), d_first_output, d_first_cell, d_x
+    return d_gates, d_gates.flatten(0, 1), d_first_output, d_first_cell, d_x
 
 
 # ---- The recurrence with an explicit gradient ----
@@ -186,10 +193,16 @@ class _Sequence(torch.autograd.Function):
             d_outputs[-1] += d_last_output
         d_cell = None if d_cell is None else aligned(d_cell)
         backward = _backward_on_cpu if ctx.on_cpu else _backward_on_clusters
-        d_gates, d_bias, d_output, d_cell, d_x = backward(
-            input_weight, weight, reset, saved, d_outputs, d_cell
-        )
         residual = d_sum if ctx.is_residual else None
+        if residual is not None and not ctx.on_cpu:
+            residual = residual.clone()
+        event = beside.ready(d_outputs) if d_cell is None else None
+        with beside.second_stream(x.device, event) as join:
+            d_gates, d_bias, d_output, d_cell, d_x = backward(
+                input_weight, weight, reset, saved, d_outputs, d_cell
+            )
+        join()
+        d_bias = d_bias.sum(0) if ctx.on_cpu else sum_rows(d_bias)
         if d_x is None:
             d_x = gradient_of_inputs(d_gates, input_weight, residual)
         elif residual is not None:

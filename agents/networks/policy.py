@@ -14,6 +14,7 @@ from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, heads, intakes, running_norm
+from megastep.agents.networks.beside import meanwhile
 from megastep.agents.networks.linear import ComputeDtype
 from megastep.arrdict import arrdict
 from megastep.devices import set_threads, threads
@@ -254,14 +255,17 @@ class Policy(nn.Module):
         only of these lanes of `obs` and `privileged`: other arguments have M lanes then, not B, and
         are those of `unroll` and `value`.
         """
-        from megastep.agents.networks.critic import head_terms
+        from megastep.agents.networks.critic import head_terms, start_heads
 
+        prediction = self.prediction if self.privileged_space and has_errors else None
+        heads_of = self.output, self.critic, prediction
+
+        encode = functools.partial(self.critic.encode, privileged, lanes)
         with self.compute_dtype():
-            features, _ = self._features(obs, reset, state, lanes)
-            encoded = self.critic.encode(privileged, lanes)
-            prediction = self.prediction if self.privileged_space and has_errors else None
-            heads_of = self.output, self.critic, prediction
-            terms = head_terms(*heads_of, features, encoded, actions, mask)
+            with meanwhile(functools.partial(start_heads, *heads_of, encode, mask)) as results:
+                features, _ = self._features(obs, reset, state, lanes)
+            ((encoded, started),) = results
+            terms = head_terms(*heads_of, features, encoded, actions, mask, started)
         names = "logprobs", "entropies", "errors", "values", "features"
         return arrdict(zip(names, (*terms, features), strict=True))
 

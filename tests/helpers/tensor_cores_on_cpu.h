@@ -220,22 +220,18 @@ DEVICE unsigned int address_in(const void* shared, unsigned int rank) {
     return rank * SHARED_BYTES + (unsigned int)((const unsigned char*)shared - dynamic_shared);
 }
 
-template <class T>
-DEVICE void begin_sending(unsigned int target, T value, unsigned int arrivals) {
-    check_aligned(cluster_shared[0] + target, sizeof value);
+DEVICE void publish() {}
+
+DEVICE void send(unsigned int target, const void* source, int n_bytes, unsigned int arrivals) {
+    check_aligned(cluster_shared[0] + target, 16);
+    check_aligned(source, 16);
+    if (n_bytes % 16)
+        fail("sends no multiple of 16 bytes", current);
     begin_job(jobs, [=] {
         check_alive(target / SHARED_BYTES);
-        memcpy(cluster_shared[0] + target, &value, sizeof value);
+        memcpy(cluster_shared[0] + target, source, n_bytes);
         Arrivals* there = (Arrivals*)(cluster_shared[0] + arrivals);
-        there->bytes -= sizeof value;
+        there->bytes -= n_bytes;
         end_phase(there);
     });
-}
-
-DEVICE void send(unsigned int target, uint4 value, unsigned int arrivals) {
-    begin_sending(target, value, arrivals);
-}
-
-DEVICE void send(unsigned int target, float one, float two, unsigned int arrivals) {
-    begin_sending(target, float2{one, two}, arrivals);
 }

@@ -83,7 +83,7 @@ def test_products_are_the_same_by_kernels_and_by_pytorch(cuda_on_cpu, monkeypatc
         chosen.product(x, weight, bias, has_relu=True),
         onto,
         chosen.gradient_of_inputs(d.view(3, 7, -1), weight).flatten(0, 1),
-        chosen.gradient_of_inputs(d, weight, addend),
+        chosen.gradient_of_inputs(d, weight, addend.clone()),
     ]
     check_products(inputs, [result.bfloat16() for result in results])
     expected = inputs[3].double().T @ inputs[0].double()

@@ -3,6 +3,7 @@ stands for one.
 """
 
 import copy
+import functools
 
 import pytest
 import torch
@@ -76,8 +77,10 @@ def test_terms_and_gradients_match_pytorch(
             )
             x.requires_grad_()
             with torch.autocast(x.device.type, BF16):
-                assert critic_module._fits_joint(*of, x, *others) == x.is_cuda
-                terms = critic_module._terms_on_gpu(*of, x, *others)
+                _, started = critic_module.start_heads(*of, functools.partial(next, iter(others)))
+                inputs = *of, x, *others, None, started
+                assert critic_module._fits_joint(*inputs) == x.is_cuda
+                terms = critic_module._terms_on_gpu(*inputs)
         else:
             of, x = plain, features.float().requires_grad_()
             with plain_operations():

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from megastep.agents.networks.critic import ValueOutput
+from megastep.agents.networks.value_output import ValueOutput
 
 WIDTH, VALID = 24, torch.ones(64, dtype=torch.bool)
 

@@ -2,6 +2,8 @@
 #include "common/dependent_launch.h"
 #include "params.h"
 
+constexpr int STEPS = 16;  // that a thread reads at once
+
 // Generalised advantage estimation.
 KERNEL gae(GaeParams p) {
     wait_for_previous();
@@ -10,18 +12,32 @@ KERNEL gae(GaeParams p) {
         return;
     float advantage = 0.f, next_value = p.last_value[lane];
     float gamma = *p.gamma, lambda_ = *p.lambda_;
-#pragma unroll 4
-    for (int t = p.n_steps - 1; t >= 0; t--) {
-        long long at = t * (long long)p.n_lanes + lane;
-        float value = p.values[at];
-        bool reset = p.reset[at], terminal = p.terminal[at], truncated = p.truncated[at];
-        float delta = p.reward[at] + gamma * (terminal ? 0.f : next_value) - value;
-        bool ends = terminal || truncated || reset;
-        advantage = (reset ? 0.f : delta) + (ends ? 0.f : gamma * lambda_ * advantage);
-        p.advantages[at] = advantage;
-        p.targets[at] = advantage + value;
-        p.valid[at] = !reset && (!p.learns || p.learns[at]);
-        next_value = value;
+    // Steps are read together, before a write that might be to what they read.
+    for (int last = p.n_steps - 1; last >= 0; last -= STEPS) {
+        float rewards[STEPS], values[STEPS];
+        bool resets[STEPS], terminals[STEPS], truncations[STEPS], valid[STEPS];
+        for (int i = 0; i < STEPS; i++) {
+            long long at = max(last - i, 0) * (long long)p.n_lanes + lane;
+            rewards[i] = p.reward[at];
+            values[i] = p.values[at];
+            resets[i] = p.reset[at];
+            terminals[i] = p.terminal[at];
+            truncations[i] = p.truncated[at];
+            valid[i] = !p.learns || p.learns[at];
+        }
+        for (int i = 0; i < STEPS; i++) {
+            if (i > last)
+                break;
+            long long at = (last - i) * (long long)p.n_lanes + lane;
+            float value = values[i];
+            float delta = rewards[i] + gamma * (terminals[i] ? 0.f : next_value) - value;
+            bool ends = terminals[i] || truncations[i] || resets[i];
+            advantage = (resets[i] ? 0.f : delta) + (ends ? 0.f : gamma * lambda_ * advantage);
+            p.advantages[at] = advantage;
+            p.targets[at] = advantage + value;
+            p.valid[at] = !resets[i] && valid[i];
+            next_value = value;
+        }
     }
 }
 

@@ -1,6 +1,6 @@
 // The heads of an update, from one product of the features with the weights of all of them: the
 // log-probability of the actions and the entropy, the value, the error of the auxiliary prediction,
-// and the gradient of that product. A row of the product has the prediction, the scores of the
+// and the gradient of that product. A row of the gradient has the prediction, the scores of the
 // actions, and the critic's hidden layer before its ReLU, each padded to a multiple of 8. A plain
 // critic, whose last layer has no weight here, has its value in place of that layer. Blocks are
 // strips of rows.
@@ -47,19 +47,16 @@ DEVICE Softmax softmax_of(const Bfloat16* scores, int n) {
     return softmax;
 }
 
-// One thread per row for the actions; eight threads per row for the rest.
+// Eight threads per row, of which one is for the actions.
 KERNEL __launch_bounds__(256) heads_forward(HeadsForwardParams p) {
     wait_for_previous();
-    int start = (int)blockIdx.x * STRIP;
-    int first_score = padded(p.n_predicted);
-    int first_hidden = first_score + padded(p.n_agents * p.n_choices);
-    int n_columns = first_hidden + p.width;
-    const Bfloat16* product = (const Bfloat16*)p.product;
+    int start = (int)blockIdx.x * HEADS_ROWS, first_score = padded(p.n_predicted);
 
     int row = start + (int)threadIdx.x;
-    if (p.logprobs && threadIdx.x < STRIP && row < p.n_rows) {
+    if (p.logprobs && threadIdx.x < HEADS_ROWS && row < p.n_rows) {
         float logprob = 0.f, entropy = 0.f;
-        const Bfloat16* scores = product + (long long)row * n_columns + first_score;
+        long long at = (long long)row * p.product_stride + first_score;
+        const Bfloat16* scores = (const Bfloat16*)p.product + at;
         for (int agent = 0; agent < p.n_agents; agent++, scores += p.n_choices) {
             Softmax softmax = softmax_of(scores, p.n_choices);
             long long action = p.actions[(long long)row * p.n_agents + agent];
@@ -71,36 +68,34 @@ KERNEL __launch_bounds__(256) heads_forward(HeadsForwardParams p) {
     }
 
     int part = threadIdx.x % 8;
-    for (int i = threadIdx.x / 8; i < STRIP; i += STRIP_THREADS / 8) {
-        row = min(start + i, p.n_rows - 1);  // all threads of a warp shuffle
-        const Bfloat16* columns = product + (long long)row * n_columns;
-        float value = 0.f, error = 0.f;
+    bool exists = start + (int)threadIdx.x / 8 < p.n_rows;
+    row = min(start + (int)threadIdx.x / 8, p.n_rows - 1);  // all threads of a warp shuffle
+    float value = 0.f, error = 0.f;
 #pragma unroll 4
-        for (int column = WORD * part; column < p.width; column += 8 * WORD) {
-            float hidden[WORD], weight[WORD];
-            read<Bfloat16>(hidden, columns, first_hidden + column);
-            read_value_weight(weight, p.value_weight, column);
-            for (int n = 0; n < WORD; n++)
-                value += is_cleared(hidden[n], p.value_weight) ? 0.f : hidden[n] * weight[n];
-        }
-        for (int column = WORD * part; column < p.n_predicted; column += 8 * WORD) {
-            float predicted[WORD], expected[WORD];
-            read<Bfloat16>(predicted, columns, column);
-            read<Bfloat16>(expected, p.target, (long long)row * first_score + column);
-            for (int n = 0; n < WORD; n++) {
-                float difference = predicted[n] - expected[n];
-                error += column + n < p.n_predicted ? difference * difference : 0.f;
-            }
-        }
-        value = sum_of_threads<8>(value);
-        error = sum_of_threads<8>(error);
-        if (part || start + i >= p.n_rows)
-            continue;
-        value += p.value_bias ? *p.value_bias : 0.f;
-        p.values[row] = value * *p.value_scale + *p.value_mean;
-        if (p.errors)
-            p.errors[row] = error / (float)p.n_predicted;
+    for (int column = WORD * part; column < p.width; column += 8 * WORD) {
+        float hidden[WORD], weight[WORD];
+        read<Bfloat16>(hidden, p.hidden, (long long)row * p.hidden_stride + column);
+        read_value_weight(weight, p.value_weight, column);
+        for (int n = 0; n < WORD; n++)
+            value += is_cleared(hidden[n], p.value_weight) ? 0.f : hidden[n] * weight[n];
     }
+    for (int column = WORD * part; column < p.n_predicted; column += 8 * WORD) {
+        float predicted[WORD], expected[WORD];
+        read<Bfloat16>(predicted, p.product, (long long)row * p.product_stride + column);
+        read<Bfloat16>(expected, p.target, (long long)row * first_score + column);
+        for (int n = 0; n < WORD; n++) {
+            float difference = predicted[n] - expected[n];
+            error += column + n < p.n_predicted ? difference * difference : 0.f;
+        }
+    }
+    value = sum_of_threads<8>(value);
+    error = sum_of_threads<8>(error);
+    if (part || !exists)
+        return;
+    value += p.value_bias ? *p.value_bias : 0.f;
+    p.values[row] = value * *p.value_scale + *p.value_mean;
+    if (p.errors)
+        p.errors[row] = error / (float)p.n_predicted;
 }
 
 // ---- Backward ----
@@ -116,8 +111,9 @@ DEVICE void scores_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     int row = index.strip * STRIP + (int)threadIdx.x;
     if (threadIdx.x >= STRIP || row >= p.n_rows)
         return;
-    long long at = (long long)row * index.n_columns + index.first_score;
+    long long at = (long long)row * p.product_stride + index.first_score;
     const Bfloat16* scores = (const Bfloat16*)p.product + at;
+    at = (long long)row * index.n_columns + index.first_score;
     Bfloat16* d_scores = (Bfloat16*)p.d_product + at;
     float d_logprob = p.d_logprobs[row], d_entropy = p.d_entropies[row];
     int n = p.n_choices, n_scores = p.n_agents * n;
@@ -146,26 +142,31 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
         bool is_score = column >= index.first_score;
         float sums[WORD];
         clear(sums);
-        float values[AT_ONCE][WORD], expected[AT_ONCE][WORD], d_errors[AT_ONCE];
-        auto load = [&](int i, long long row) {
-            read<Bfloat16>(values[i], is_score ? p.d_product : p.product,
-                           row * index.n_columns + column);
+        Pack<Bfloat16, WORD> words[AT_ONCE], targets[AT_ONCE];
+        float d_errors[AT_ONCE];
+        auto load_row = [&](int i, long long row) {
+            load(words[i], is_score ? p.d_product : p.product,
+                 row * (is_score ? index.n_columns : p.product_stride) + column);
             // a score has no target: reads whatever is in the first columns
             int target = is_score ? 0 : column;
             if (index.first_score)
-                read<Bfloat16>(expected[i], p.target, row * index.first_score + target);
-            d_errors[i] = index.first_score ? p.d_errors[row] * 2.f / (float)p.n_predicted : 0.f;
+                load(targets[i], p.target, row * index.first_score + target);
+            d_errors[i] = index.first_score ? p.d_errors[row] : 0.f;
         };
-        for_rows(strip, load, [&](int i, int row) {
+        for_rows(strip, load_row, [&](int i, int row) {
+            float values[WORD], expected[WORD];
+            unpack(values, words[i]);
             if (!is_score) {
+                unpack(expected, targets[i]);
+                float d_error = d_errors[i] * 2.f / (float)p.n_predicted;
                 for (int n = 0; n < WORD; n++) {
-                    float d = d_errors[i] * (values[i][n] - expected[i][n]);
-                    values[i][n] = column + n < p.n_predicted ? d : 0.f;
+                    float d = d_error * (values[n] - expected[n]);
+                    values[n] = column + n < p.n_predicted ? d : 0.f;
                 }
-                write<Bfloat16>(p.d_product, (long long)row * index.n_columns + column, values[i]);
+                write<Bfloat16>(p.d_product, (long long)row * index.n_columns + column, values);
             }
             for (int n = 0; n < WORD; n++)
-                sums[n] += values[i][n];
+                sums[n] += values[n];
         });
         add_up(sums, strip, index.sums + WORD * first_word, WORD * strip.words);
     }
@@ -182,21 +183,24 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     clear(weight_sums);
     clear(bias_sum);
     float scale = *p.value_scale;
-    float hidden[AT_ONCE][WORD], d_values[AT_ONCE];
-    auto load = [&](int i, long long row) {
-        read<Bfloat16>(hidden[i], p.product, row * index.n_columns + index.first_hidden + column);
-        d_values[i] = p.d_values[row] * scale;
+    Pack<Bfloat16, WORD> words[AT_ONCE];
+    float d_values[AT_ONCE];
+    auto load_row = [&](int i, long long row) {
+        load(words[i], p.hidden, row * p.hidden_stride + column);
+        d_values[i] = p.d_values[row];
     };
-    for_rows(strip, load, [&](int i, int row) {
-        bias_sum[0] += d_values[i];
+    for_rows(strip, load_row, [&](int i, int row) {
+        float hidden[WORD], d_value = d_values[i] * scale;
+        unpack(hidden, words[i]);
+        bias_sum[0] += d_value;
         for (int n = 0; n < WORD; n++) {
-            bool is_off = is_cleared(hidden[i][n], p.value_weight);
-            weight_sums[n] += is_off ? 0.f : d_values[i] * hidden[i][n];
-            hidden[i][n] = is_off ? 0.f : d_values[i] * weight[n];
-            sums[n] += hidden[i][n];
+            bool is_off = is_cleared(hidden[n], p.value_weight);
+            weight_sums[n] += is_off ? 0.f : d_value * hidden[n];
+            hidden[n] = is_off ? 0.f : d_value * weight[n];
+            sums[n] += hidden[n];
         }
         write<Bfloat16>(p.d_product, (long long)row * index.n_columns + index.first_hidden + column,
-                        hidden[i]);
+                        hidden);
     });
     float* target = index.sums + WORD * first_word;
     add_up(sums, strip, target + index.first_hidden, WORD * strip.words);

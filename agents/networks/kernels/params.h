@@ -7,8 +7,9 @@ constexpr int MAX_LEAVES = 8;          // of an observation, that a launch handl
 constexpr int NORMALISED_ROWS = 4;     // rows that a thread normalises
 constexpr int STRIP = 128;             // rows that a block adds up
 constexpr int STRIP_THREADS = 256;     // of such a block
+constexpr int HEADS_ROWS = 32;         // that a block of the heads' forward kernel handles
 constexpr int ACT_THREADS = 8;         // that choose one lane's actions, one per choice
-constexpr int MOMENTS_LANES = 1024;    // of a block, for one statistic
+constexpr int MOMENTS_LANES = 256;     // of a block, for one statistic
 constexpr int MOMENTS_THREADS = 1024;  // of a block that adds moments
 constexpr int MASKED_ARRAYS = 4;       // whose moments a launch computes
 constexpr int MASKED_THREADS = 256;    // of a block
@@ -180,11 +181,12 @@ struct CategoricalActParams {
     int n_choices;  // at most ACT_THREADS
 };
 
-// The heads of an update. A row of their product has the prediction, the actions' scores, and the
-// critic's hidden layer of W units before its ReLU, each padded to a multiple of 8. W = 8 without
-// such a layer: then the value is the first of these columns.
+// The heads of an update. A row of their product has the prediction and the actions' scores, and
+// one of `hidden` the critic's hidden layer of W units before its ReLU, each padded to a multiple
+// of 8. W = 8 without such a layer: then the value is the first of these columns.
 struct HeadsParams {
-    const void* product;        // (n_rows, n_columns) bfloat16
+    const void* product;        // (n_rows, first columns) bfloat16, a row every product_stride
+    const void* hidden;         // (n_rows, W) bfloat16, a row every hidden_stride
     const void* target;         // (n_rows, n_predicted, padded) bfloat16, of the prediction
     const long long* actions;   // (n_rows, A)
     const float* value_weight;  // (W); null: there is no hidden layer
@@ -193,7 +195,9 @@ struct HeadsParams {
     int n_predicted;
     int n_agents;
     int n_choices;
-    int width;  // a multiple of 8
+    int width;           // a multiple of 8, as strides are
+    int product_stride;  // numbers
+    int hidden_stride;
 };
 
 struct HeadsForwardParams : HeadsParams {
@@ -210,7 +214,7 @@ struct HeadsBackwardParams : HeadsParams {
     const float* d_entropies;  // (n_rows)
     const float* d_errors;     // (n_rows)
     const float* d_values;     // (n_rows)
-    void* d_product;           // (n_rows, n_columns) bfloat16
+    void* d_product;           // (n_rows, n_columns) bfloat16, of both
     float* sums;               // (n_strips, n_columns + W + 8), of d_product, and the gradients
                                // of the value's weight and bias, over STRIP rows each
 };

@@ -117,6 +117,11 @@ def without_early_starts() -> Iterator[None]:
         _n_without_early_starts -= 1
 
 
+def is_shared() -> bool:
+    """Returns whether a `without_early_starts` is open: many streams share the GPU."""
+    return _n_without_early_starts > 0
+
+
 @functools.cache
 def _can_start_early(index: int) -> bool:
     """Returns whether a GPU has programmatic dependent launch."""

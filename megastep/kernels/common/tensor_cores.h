@@ -187,19 +187,15 @@ DEVICE unsigned int address_in(const void* shared, unsigned int rank) {
     return there;
 }
 
-// Begins to write to another block's shared memory. Its `arrivals` count the bytes as they come.
-DEVICE void send(unsigned int target, uint4 value, unsigned int arrivals) {
-    asm volatile(
-        "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.b32 "
-        "[%0], {%1, %2, %3, %4}, [%5];" ::"r"(target),
-        "r"(value.x), "r"(value.y), "r"(value.z), "r"(value.w), "r"(arrivals)
-        : "memory");
-}
+// Lets this thread's writes to shared memory be sent by others of its block, after a barrier.
+DEVICE void publish() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
 
-DEVICE void send(unsigned int target, float one, float two, unsigned int arrivals) {
+// Begins to copy from shared memory to that of a block of the cluster, a multiple of 16 bytes, from
+// and to a multiple of 16. The other's `arrivals` count the bytes as they come.
+DEVICE void send(unsigned int target, const void* source, int n_bytes, unsigned int arrivals) {
     asm volatile(
-        "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.f32 "
-        "[%0], {%1, %2}, [%3];" ::"r"(target),
-        "f"(one), "f"(two), "r"(arrivals)
+        "cp.async.bulk.shared::cluster.shared::cta.mbarrier::complete_tx::bytes [%0], [%1], %2, "
+        "[%3];" ::"r"(target),
+        "r"(shared_address(source)), "r"(n_bytes), "r"(arrivals)
         : "memory");
 }

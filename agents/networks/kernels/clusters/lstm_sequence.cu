@@ -109,13 +109,13 @@ DEVICE void write_floats(float* target, uint4 bits) {
                             high_half(bits.w)};
 }
 
-// Announces what comes of even and odd steps, of both groups: so many bytes per lane.
-DEVICE void init_arrivals(Arrivals (&arrivals)[2][2], int n_bytes) {
+// Announces what comes of even and odd steps, of both groups, in bytes.
+DEVICE void init_arrivals(Arrivals (&arrivals)[2][2], int first_bytes, int second_bytes) {
     for (int i = 0; i < 2; i++) {
         init(&arrivals[i][0]);
-        expect(&arrivals[i][0], n_bytes * Group<0>::LANES);
+        expect(&arrivals[i][0], first_bytes);
         init(&arrivals[i][1]);
-        expect(&arrivals[i][1], n_bytes * Group<1>::LANES);
+        expect(&arrivals[i][1], second_bytes);
     }
 }
 
@@ -141,7 +141,7 @@ struct ForwardMemory {
 template <int W>
 DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     constexpr int RANKS = W / UNITS;
-    constexpr int SENT = UNITS * (int)sizeof(Bits);  // by a block, per lane
+    constexpr int SENT = (UNITS + PAD) * (int)sizeof(Bits);  // by a block, per lane
     ForwardMemory<W>& memory = *(ForwardMemory<W>*)shared_memory;
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
@@ -205,7 +205,8 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         }
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
     if (!me.index)
-        init_arrivals(memory.arrivals, RANKS * SENT);
+        init_arrivals(memory.arrivals, RANKS * SENT * Group<0>::LANES,
+                      RANKS * SENT * Group<1>::LANES);
     wait_for_copies<1>();
     cluster_barrier();
 
@@ -266,24 +267,25 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
             }
         if (G::NUMBER)
             wait_for_copies<1>();
+        publish();
         __syncthreads();
-        // the first threads send the next step's inputs, the others write outputs
+        if (me.index < RANKS && !is_last) {  // a thread per block that it sends to
+            const Bits* target = memory.hidden[(t + 1) & 1][rank][G::FIRST_LANE];
+            send(address_in(target, me.index), memory.next_hidden[t & 1][G::FIRST_LANE],
+                 SENT * G::LANES, address_in(&memory.arrivals[(t + 1) & 1][G::NUMBER], me.index));
+        }
+        // the first threads write the next step's inputs, the others outputs
         constexpr int WORDS = G::LANES * UNITS / 8;
         for (int i = me.index; i < 2 * WORDS; i += THREADS) {
-            bool sends = i < WORDS;
-            int word = sends ? i : i - WORDS, lane = G::FIRST_LANE + (word >> 3);
+            bool is_input = i < WORDS;
+            int word = is_input ? i : i - WORDS, lane = G::FIRST_LANE + (word >> 3);
             int part = 8 * (word & 7);
             bool exists = first_lane + lane < n_lanes;
             long long at = ((long long)t * n_lanes + first_lane + lane) * W + rank * UNITS + part;
-            if (sends && !is_last) {
-                uint4 value = *(const uint4*)&memory.next_hidden[t & 1][lane][part];
-                const Bits* target = &memory.hidden[(t + 1) & 1][rank][lane][part];
-                Arrivals* arrivals = &memory.arrivals[(t + 1) & 1][G::NUMBER];
-                for (int other = 0; other < RANKS; other++)
-                    send(address_in(target, other), value, address_in(arrivals, other));
-                if (exists)
-                    *(uint4*)(hiddens + at + (long long)n_lanes * W) = value;
-            } else if (!sends && exists) {
+            if (is_input && exists && !is_last)
+                *(uint4*)(hiddens + at + (long long)n_lanes * W) =
+                    *(const uint4*)&memory.next_hidden[t & 1][lane][part];
+            else if (!is_input && exists) {
                 uint4 value = *(const uint4*)&memory.output[t & 1][lane][part];
                 if (is_last)
                     write_floats(
@@ -311,15 +313,21 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
 
 // ---- Backward ----
 
-// The sums for a block's units and a group's lanes. Rows are 24 numbers apart for both groups, so
-// that the threads of half a warp write to different banks.
-typedef float Parts[UNITS][Group<0>::LANES];
-static_assert(Group<0>::LANES == 24);
+// Sums for units and a group's lanes, of even and odd steps: for each block and from each block.
+// Rows are so far apart that the threads of half a warp write to different banks, mostly.
+template <int RANKS, int N>
+struct Exchange {
+    static constexpr int BYTES = UNITS * N * (int)sizeof(float);  // for a block
+    float sent[2][RANKS][UNITS][N], received[2][RANKS][UNITS][N];
+};
 
 template <int W>
 struct BackwardMemory {
     static constexpr int RANKS = W / UNITS;
-    Parts parts[2][2][RANKS];  // of even and odd steps, of both groups, by the block that sends
+    Exchange<RANKS, 24> first;
+    Exchange<RANKS, 20> second;
+    Exchange<RANKS, 24>& of(Group<0>) { return first; }
+    Exchange<RANKS, 20>& of(Group<1>) { return second; }
     Bits d_gates[LANES][GATES + PAD];
     Bits d_output[2][LANES][UNITS + PAD];
     Arrivals arrivals[2][2];
@@ -329,7 +337,6 @@ struct BackwardMemory {
 template <int W>
 DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     constexpr int RANKS = W / UNITS;
-    constexpr int SENT = UNITS * (int)sizeof(float);             // by a block, per lane
     constexpr int ROWS = W / (THREADS / 32), TILES = ROWS / 16;  // of a warp
     static_assert(ROWS % 16 == 0, "a warp multiplies whole tiles of 16 units");
     BackwardMemory<W>& memory = *(BackwardMemory<W>*)shared_memory;
@@ -391,7 +398,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     load_saved(n_steps - 1, Group<1>());
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
     if (!me.index)
-        init_arrivals(memory.arrivals, RANKS * SENT);
+        init_arrivals(memory.arrivals, RANKS * memory.first.BYTES, RANKS * memory.second.BYTES);
     wait_for_copies<0>();
     cluster_barrier();
 
@@ -399,14 +406,15 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     auto receive = [&](float (&d_hiddens)[COLUMNS][2], int t, auto group) {
         typedef decltype(group) G;
         Arrivals* arrivals = &memory.arrivals[t & 1][G::NUMBER];
+        auto& exchange = memory.of(G());
         wait_for(arrivals, (n_steps - 1 - t) >> 1);
         if (!me.index)
-            expect(arrivals, RANKS * SENT * G::LANES);
+            expect(arrivals, RANKS * exchange.BYTES);
         for (int j = 0; j < G::COLUMNS; j++) {
             float2 sum = {0.f, 0.f};
             for (int other = 0; other < RANKS; other++) {
-                const Parts& parts = memory.parts[t & 1][G::NUMBER][other];
-                float2 pair = *(const float2*)&parts[me.unit][8 * j + 2 * me.q];
+                float2 pair =
+                    *(const float2*)&exchange.received[t & 1][other][me.unit][8 * j + 2 * me.q];
                 sum.x += pair.x;
                 sum.y += pair.y;
             }
@@ -465,16 +473,21 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         __syncthreads();
         float sums[TILES][C][4] = {};
         multiply<GATES, GATES>(sums, weights, &memory.d_gates[G::FIRST_LANE][0], 0, me);
+        auto& exchange = memory.of(G());
         for (int tile = 0; tile < TILES; tile++)
             for (int upper = 0; upper < 2; upper++) {
                 int row = ROWS * me.warp + 16 * tile + me.g + 8 * upper;
-                const float* target = &memory.parts[t & 1][G::NUMBER][rank][row % UNITS][2 * me.q];
-                unsigned int there = address_in(target, row / UNITS);
-                unsigned int arrivals = address_in(&memory.arrivals[t & 1][G::NUMBER], row / UNITS);
+                float* to = &exchange.sent[t & 1][row / UNITS][row % UNITS][2 * me.q];
                 for (int j = 0; j < C; j++)
-                    send(there + 8 * j * (int)sizeof(float), sums[tile][j][2 * upper],
-                         sums[tile][j][2 * upper + 1], arrivals);
+                    *(float2*)(to + 8 * j) =
+                        float2{sums[tile][j][2 * upper], sums[tile][j][2 * upper + 1]};
             }
+        publish();
+        __syncthreads();
+        if (me.index < RANKS)  // a thread per block that it sends to
+            send(address_in(exchange.received[t & 1][rank], me.index),
+                 exchange.sent[t & 1][me.index], exchange.BYTES,
+                 address_in(&memory.arrivals[t & 1][G::NUMBER], me.index));
         for (int n = 0; n < G::LANES * GATES / 8 / THREADS; n++) {
             int i = me.index + n * THREADS, lane = G::FIRST_LANE + (i >> 5), gate = i >> 3 & 3;
             int part = 8 * (i & 7);

@@ -12,9 +12,9 @@ constexpr int SEQUENCE_LANES = 40;
 constexpr int MAX_STEPS = 512;  // of a sequence
 // Bytes of shared memory of a block, for 128 and for 256 units
 constexpr int FORWARD_MEMORY_128 = 136608;
-constexpr int BACKWARD_MEMORY_128 = 85920;
+constexpr int BACKWARD_MEMORY_128 = 126880;
 constexpr int FORWARD_MEMORY_256 = 159648;
-constexpr int BACKWARD_MEMORY_256 = 135072;
+constexpr int BACKWARD_MEMORY_256 = 216992;
 
 struct LstmSequenceParams {
     const void* weight;          // recurrent: (4 W, W); backward: (W, 4 W), transposed

@@ -1,0 +1,76 @@
+"""Work on a second stream beside an LSTM's sequence."""
+
+import pytest
+import torch
+
+from megastep import engine, spaces
+from megastep.agents.algorithms.ppo import PPO
+from megastep.agents.networks import beside
+from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.rollout import Rollout
+from tests.helpers.made_up import MOVES, OBS, weights
+
+
+@pytest.mark.parametrize("has_sequence", [True, False])
+def test_work_is_done_once_by_a_sequence_or_at_the_end(has_sequence):
+    done = []
+    with beside.meanwhile(lambda: done.append("work") or "result") as results:
+        if has_sequence:
+            beside.waiting()()
+        assert results == ["result"] * has_sequence
+    assert (results, done, beside.waiting()) == (["result"], ["work"], None)
+
+
+class Marked(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        return 2 * x
+
+    @staticmethod
+    def backward(ctx, d):
+        return beside.mark(2 * d)
+
+
+class Reader(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, found):
+        ctx.found = found
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, d):
+        ctx.found.append(beside.ready(d))
+        return d, None
+
+
+@pytest.mark.parametrize("other", ["none", "before", "after"])
+def test_a_gradient_is_ready_only_if_nothing_is_added_to_it(monkeypatch, other):
+    monkeypatch.setattr(beside, "now", lambda device: "an event")
+    found = []
+    y = Reader.apply(torch.ones(3, requires_grad=True), found)
+    terms = [Marked.apply(y), *[y.square()] * (other != "none")]
+    sum(term.sum() for term in (terms if other == "after" else terms[::-1])).backward()
+    assert found == ["an event" if other == "none" else None]
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("layers", [1, 2])
+def test_an_update_is_the_same_on_one_stream(layers):
+    """Where streams share a GPU there is no second one."""
+    privileged, n_lanes, ends = spaces.MultiVector(1, 12), 4096, []
+    for is_shared in (True, False):
+        torch.manual_seed(1)
+        policy = Policy(OBS, MOVES, privileged, width=256, layers=layers).cuda()
+        state = policy.initial(n_lanes)
+        rollout = Rollout(16, n_lanes, OBS, MOVES, state, "cuda", privileged)
+        for leaf in (rollout.obs, rollout.privileged, rollout.reward):
+            leaf.normal_()
+        learner = PPO(policy, n_minibatches=2, lr=1e-2, graph=True)
+        for _ in range(6):
+            if is_shared:
+                with engine.without_early_starts():
+                    learner.update(rollout)
+            else:
+                learner.update(rollout)
+        ends.append(weights(policy))
+    assert torch.equal(*ends) and ends[0].isfinite().all()
