@@ -88,6 +88,7 @@ class _JointLoss(torch.autograd.Function):
     def forward(
         ctx, batch, output, coefficients, features, *parameters
     ) -> tuple[torch.Tensor, torch.Tensor]:
+        ctx.set_materialize_grads(False)
         features = aligned(features.flatten(0, -2))
         heads = [cast(leaf, features.dtype, multiple=8) for leaf in parameters]
         n_rows, width = features.shape
