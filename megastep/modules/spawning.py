@@ -176,14 +176,17 @@ class RandomSpawns:
 
 
 def of_layouts(geometries: Sequence[dotdict], core: Core) -> Sequence[dotdict]:
-    """Returns the geometries. ValueError unless there is one for each layout of the scenery."""
-    if len(geometries) != len(core.scenery.layouts):
+    """Returns the geometry of each layout of the scenery. ValueError unless there are as many, or
+    more of one and the same.
+    """
+    n = len(core.scenery.layouts)
+    if len(geometries) < n or len(geometries) > n and len({*map(id, geometries)}) > 1:
         raise ValueError(
-            f"geometries must be those that the scenery was made from, one for each of its "
-            f"{len(core.scenery.layouts)} layouts, but {len(geometries)} were given: use the list "
-            "that scene.scenery got, such as scene.spread(geometries, n_envs)"
+            f"geometries must be those that the scenery was made from, one for each of its {n} "
+            f"layouts, but {len(geometries)} were given: use the list that scene.scenery got, such "
+            "as scene.spread(geometries, n_envs)"
         )
-    return geometries
+    return geometries[:n]
 
 
 def cached_points(

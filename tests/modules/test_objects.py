@@ -222,7 +222,7 @@ def test_bad_calls_are_named():
     assert objects.all.solid.all()
     with pytest.raises(ValueError, match="give all kinds to one Objects"):
         Objects([toys.box()] * 4, core, {"crate": Crate(1)})
-    geometries = [toys.box()] * 3
+    geometries = [toys.box(), toys.box(), toys.column()]
     other = Core(scene.scenery(geometries, n_envs=2, device=core.device))
     for given in geometries[:2], geometries * 2:
         message = f"for each of its 3 layouts, but {len(given)} were given: use"
