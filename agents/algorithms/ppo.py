@@ -15,7 +15,6 @@ from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.gradient_steps import one
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalise
-from megastep.agents.networks.beside import now, second_stream
 from megastep.agents.networks.fused import aligned, fused
 from megastep.agents.networks.heads import MultiDiscreteOutput
 from megastep.agents.networks.linear import cast, gradient_of_weights, sum_rows
@@ -247,8 +246,6 @@ class PPO(learner.ActorCritic):
         self.normalise_advantage = normalise_advantage
 
     def _update(self, rollout) -> "dict[str, torch.Tensor]":
-        with second_stream(self.device, now(self.device)) as join:
-            first = self.minibatches(rollout.n_lanes)
         transitions = rollout.transitions()
         numbers = {name: self.coefficients[name] for name in ("gamma", "lambda_")}
         estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **numbers)
@@ -268,10 +265,9 @@ class PPO(learner.ActorCritic):
             estimates["old_value"] = transitions["value"]
         estimates["n_valid"] = valid.sum(0, keepdim=True)  # of each lane
 
-        join()
         is_enabled = True
-        for epoch in range(self.n_epochs):
-            for lanes in self.minibatches(rollout.n_lanes) if epoch else first:
+        for _ in range(self.n_epochs):
+            for lanes in self.minibatches(rollout.n_lanes):
                 parts = SEQUENCES if self.has_extra_loss else _PARTS
                 batch = rollout.sequences(lanes, parts, estimates)
                 batch["n_valid"] = batch.pop("n_valid").sum()

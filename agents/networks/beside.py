@@ -77,8 +77,12 @@ def mark(gradient: torch.Tensor) -> torch.Tensor:
 
 
 def ready(gradient: torch.Tensor) -> torch.cuda.Event | None:
-    """Returns when a marked gradient was computed; None if nothing tells, or something was added to
-    it since.
+    """Returns when a marked gradient was computed, to the first who asks. None: unknown, or
+    something was added to it since.
+
+    Who asks second waits for the current stream, which still reads what the first computed on the
+    second stream, and has freed there.
     """
     event, version = getattr(gradient, "ready", (None, 0))
+    gradient.ready = None, 0  # pyright: ignore[reportAttributeAccessIssue]
     return event if version == gradient._version else None
