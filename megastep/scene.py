@@ -89,20 +89,17 @@ def _part(geometries, name, shape) -> list:
     """Returns one part of all geometries as arrays. Raises ValueError if one does not fit."""
     parts = []
     for i, g in enumerate(geometries):
-        try:
-            array = np.asarray(getattr(g, name, None), float)
-            fits = array.size == 0 or (
-                array.shape[1:] == shape and bool((np.abs(array) < checks.LIMIT).all())
-            )
-        except (TypeError, ValueError):
-            fits = False
+        array = getattr(g, name, None)
+        fits = isinstance(array, np.ndarray) and array.dtype.kind in "iuf"
+        if fits and array.size:
+            fits = array.shape[1:] == shape and bool((np.abs(array) < checks.LIMIT).all())
         if not fits:
             raise ValueError(
-                f"geometries[{i}].{name} must be an array of numbers below {checks.LIMIT:g} of "
-                f"shape {('n', *shape)}: make geometries with megastep.toys or "
+                f"geometries[{i}].{name} must be a numpy array of numbers below {checks.LIMIT:g}, "
+                f"of shape {('n', *shape)}: make geometries with megastep.toys or "
                 f"megastep.geometries.sample"
             )
-        parts.append(np.reshape(getattr(g, name), (-1, *shape)))
+        parts.append(np.reshape(array, (-1, *shape)))
     return parts
 
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from megastep import cache, core, engine, scene, toys
+from megastep.dotdict import dotdict
 from megastep.engine import operations
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.ragged import Ragged
@@ -222,3 +223,11 @@ def test_light_from_the_cache_has_the_same_bits(tmp_path, monkeypatch):
         monkeypatch.setattr(operations, "bake", bake)
         scenery = scene.scenery([toys.box(), toys.column()], device="cpu")
         assert scenery.layouts.texels.equal(baked) and not baked[:, 3].eq(1).all()
+
+
+@pytest.mark.parametrize("name", ("walls", "lights"))
+def test_a_geometry_of_lists_is_refused(name):
+    box = toys.box()
+    lists = dotdict(box, **{name: box[name].tolist()})
+    with pytest.raises(ValueError, match=rf"geometries\[1\].{name} must be a numpy array of num"):
+        scene.scenery([box, lists], device="cpu")
