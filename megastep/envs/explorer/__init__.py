@@ -159,7 +159,7 @@ class Explorer(FirstPerson):
             limits=self.limits,
             n_words=self.seen.shape[-1],
             patience=self.patience,
-            texels_per_point=TEXELS_PER_POINT,
+            points_per_texel=1 / TEXELS_PER_POINT,
         )
 
     @property

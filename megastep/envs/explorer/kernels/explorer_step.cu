@@ -10,6 +10,7 @@ template <int binned>
 DEVICE int count_left(const ExplorerStepParams& p, int agent, const Range& runs, const Pose& pose,
                       int warp_lane, int* bins) {
     const unsigned int* seen = seen_by(p, agent);
+    asm("" : "+l"(seen));  // else its offset is computed anew for each run
     unsigned int last = p.n_words - 1;
     int n_left = 0;
 #pragma unroll 1
@@ -22,7 +23,7 @@ DEVICE int count_left(const ExplorerStepParams& p, int agent, const Range& runs,
                 run[k] = LOAD((const Run*)p.runs + first + k * WARP);
         }
         for (int k = 0; k < BATCH; k++) {
-            counts[k] = run[k].bits ? unseen_of(run[k].word, run[k].bits, seen, last) : 0;
+            counts[k] = unseen_of(run[k].word, run[k].bits, seen, last);
             n_left += counts[k];
         }
         for (int k = 0; binned && k < BATCH; k++)
@@ -36,9 +37,14 @@ DEVICE int count_left(const ExplorerStepParams& p, int agent, const Range& runs,
 DEVICE void step_privileged(const ExplorerStepParams& p, int agent, int warp_lane, int* bins) {
     if (!takes_part(p, agent))
         return;
-    int env = agent / p.scenery.n_agents, layout = layout_of(p.scenery, env, p.error_flag);
+    const SceneryParams& s = p.scenery;
+    int env = agent / s.n_agents, index = s.layout[env];  // read beside all that follows
+#pragma unroll 1
+    for (int k = WARP * warp_lane; k < p.n_words; k += WARP * WARP)
+        PREFETCH(seen_by(p, agent) + k);
     Episode episode = next(p, read_episode(p, agent));
     Pose pose = pose_of(p, agent, env);
+    int layout = checked(index, s.n_layouts, p.error_flag, env, BAD_LAYOUT);
     for (int k = warp_lane; k < BINS; k += WARP)
         bins[k] = 0;
     __syncwarp();

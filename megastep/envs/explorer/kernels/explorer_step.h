@@ -21,7 +21,7 @@ struct ExplorerStepParams : GameParams {
     int n_words;
     int n_runs;              // S
     int patience;            // steps that an episode lasts beside one per texel seen
-    float texels_per_point;  // texels seen for the first time that earn a reward of 1
+    float points_per_texel;  // reward for a texel seen for the first time
 };
 
 // Visible texels of one wall that share a word of bits, at most 1.6 m. They are all counted at the
@@ -59,12 +59,12 @@ constexpr float BAND_ENDS[] = {1.5f, 4.f};  // metres
 // Sector 0 is straight ahead, 4 to the left, 8 behind. Bearings are compared with the tangents of
 // odd multiples of 11.25 degrees, which needs no arc tangent.
 HD int sector_of(float ahead, float left) {
-    float along = ahead < 0.f ? -ahead : ahead, across = left < 0.f ? -left : left;
+    float along = ABS(ahead), across = ABS(left);
     int sector = (across > 0.19891237f * along) + (across > 0.66817864f * along) +
                  (across > 1.49660576f * along) + (across > 5.02733949f * along);
     if (ahead < 0.f)
         sector = SECTORS / 2 - sector;
-    return left < 0.f ? (SECTORS - sector) % SECTORS : sector;
+    return (left < 0.f ? -sector : sector) & (SECTORS - 1);
 }
 
 HD int band_of(float ahead, float left) {
@@ -99,7 +99,7 @@ HD Episode next(const ExplorerStepParams& p, const Episode& before) {
 HD int is_over(const Episode& episode) { return episode.age >= episode.limit; }
 
 HD void write_episode(const ExplorerStepParams& p, const Episode& episode, int agent) {
-    float reward = episode.reset ? 0.f : (float)episode.newly_seen / p.texels_per_point;
+    float reward = episode.reset ? 0.f : (float)episode.newly_seen * p.points_per_texel;
     p.limits[agent] = episode.limit;
     write_outcome(p, agent, reward, episode.reset, episode.age, is_over(episode), 0);
 }
@@ -118,6 +118,7 @@ HD float episode_number(const ExplorerStepParams& p, const Episode& episode, int
     return (float)(k == 1 ? episode.age : k == 2 ? episode.limit - p.patience : n_left) / 1000.f;
 }
 
+// A root or a division of 0 takes a GPU ten times as long.
 HD float unseen_number(const ExplorerStepParams& p, int count) {
-    return SQRT((float)count / p.texels_per_point);
+    return count ? SQRT((float)count * p.points_per_texel) : 0.f;
 }
