@@ -4,9 +4,9 @@
 //
 // `render` is for many agents and for all outputs: one warp per agent, and so many warps per
 // multiprocessor that 40 registers are left for each thread, which spills some. `unspilled`, for
-// observations only, has fewer, with 56 registers per thread: faster until there are many agents.
-// `split`, for few agents, has a block of two warps per agent. It takes whole tiles of 32 rays, so
-// `subsample` must divide 32.
+// observations only, has fewer, with 64 registers per thread: faster until there are many agents.
+// `split`, for few agents, has a block of two warps per agent, with 56 registers per thread. It
+// takes whole tiles of 32 rays, so `subsample` must divide 32.
 #include "raster_cuda.h"
 
 // The sum over `n` warp lanes, in order: this one and those after it.
@@ -230,7 +230,7 @@ DEVICE void render_halves(const RenderParams& p) {
 
 INSTANCE(BOUNDS(24) render, RenderParams, render_by_warps<1>)
 INSTANCE(BOUNDS(24) render_objects, RenderParams, render_by_warps<1, 1>)
-INSTANCE(BOUNDS(18) render_unspilled, RenderParams, render_by_warps<0>)
-INSTANCE(BOUNDS(18) render_objects_unspilled, RenderParams, render_by_warps<0, 1>)
+INSTANCE(BOUNDS(16) render_unspilled, RenderParams, render_by_warps<0>)
+INSTANCE(BOUNDS(16) render_objects_unspilled, RenderParams, render_by_warps<0, 1>)
 INSTANCE(BOUNDS(18) render_split, RenderParams, render_halves<0>)
 INSTANCE(BOUNDS(18) render_objects_split, RenderParams, render_halves<OBJECTS>)

@@ -7,7 +7,7 @@
 #define HD static __device__ __forceinline__
 #define RARE static __device__ __noinline__
 // Blocks that a multiprocessor should hold at once, or as many as it can. With 64 threads each, 24
-// blocks leave a thread 40 of its 65,536 registers, 20 leave it 48, and 18 leave it 56.
+// blocks leave a thread 40 of its 65,536 registers, 20 leave it 48, 18 leave it 56, 16 leave it 64.
 #if __CUDA_ARCH__ == 750 || __CUDA_ARCH__ == 860 || __CUDA_ARCH__ == 870
 #define MAX_BLOCKS 16
 #elif __CUDA_ARCH__ == 890 || __CUDA_ARCH__ >= 1200
