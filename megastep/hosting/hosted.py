@@ -215,6 +215,9 @@ class ParallelEnvs(Hosted):
         self.render_mode = kwargs.get("render_mode")
         lanes = batch_space(spaces[0], len(self.latest))
         self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]
+        if isinstance(first, tuple) and isinstance(first[0], Mapping) and first[0]:
+            # of agents that join later: zeros may be outside of the space
+            self.latest = [copy.deepcopy(next(iter(first[0].values())))] * len(self.latest)
         self.present = self.infos["present"] = np.zeros(len(self.latest), bool)
 
     def _common(self, space_of) -> gymnasium.Space:
