@@ -1,7 +1,7 @@
 """Scenery from geometries: textures, lights, the agents' model, baked light."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -89,7 +89,7 @@ def _part(geometries, name, shape) -> list:
     """Returns one part of all geometries as arrays. Raises ValueError if one does not fit."""
     parts = []
     for i, g in enumerate(geometries):
-        array = getattr(g, name, None)
+        array: Any = getattr(g, name, None)
         fits = isinstance(array, np.ndarray) and array.dtype.kind in "iuf"
         if fits and array.size:
             fits = array.shape[1:] == shape and bool((np.abs(array) < checks.LIMIT).all())
