@@ -232,18 +232,26 @@ class Waves:
         copy_tree(start, arrdict(world=kept, state=self.actor.initial(self.n_lanes, device)))
         self.actor.draws.on(device).manual_seed(stream_seed(seed, "actions"))
 
-    def play(self, wave: int) -> tuple[dict[str, torch.Tensor], np.ndarray, np.ndarray | None]:
-        """Plays a wave. Returns its arrays (B, T + 1, ...), lengths (B,) and layouts (B,)."""
+    def play(
+        self, wave: int
+    ) -> tuple[dict[str, torch.Tensor], np.ndarray, np.ndarray, np.ndarray | None]:
+        """Plays a wave. Returns its arrays (B, T + 1, ...), lengths (B,), layouts (B,), and when
+        episodes begin, (B,): at 0, or once an agent that joins later is there.
+        """
         self._begin(wave)
         layout = optional(self.told.env, "layout")
         layout = None if layout is None else layout.repeat_interleave(self.n_agents).cpu().numpy()
-        parts, lengths = [], np.zeros(self.n_lanes, np.int64)
+        parts, (lengths, begins) = [], np.zeros((2, self.n_lanes), np.int64)
         while not lengths.all() and len(parts) * STEPS < self.most:
             rollout = self.collect()
             parts.append(self._part(rollout))
             ends = (parts[-1]["terminal"] | parts[-1]["truncated"]).cpu().numpy()
-            first = len(parts) * STEPS - STEPS + ends.argmax(1) + 1
-            lengths = np.where((lengths == 0) & ends.any(1), first, lengths)
+            first, is_on = len(parts) * STEPS - STEPS + ends.argmax(1) + 1, lengths == 0
+            lengths = np.where(is_on & ends.any(1), first, lengths)
+            times = np.arange(len(parts) * STEPS - STEPS, len(parts) * STEPS) + 1
+            until = np.minimum(np.where(lengths == 0, self.most, lengths), self.most)
+            starts = rollout.starts[1:].T.cpu().numpy() & is_on[:, None]
+            begins = np.maximum(begins, (starts * times * (times < until[:, None])).max(1))
         last, arrays = self._part(rollout, last=True), {}
         for name in parts[0]:
             rows = [part[name] for part in parts]
@@ -258,7 +266,7 @@ class Waves:
         is_cut = np.flatnonzero((lengths == 0) | (lengths > self.most))
         lengths[is_cut] = end = min(self.most, STEPS * len(parts))
         arrays["truncated"][is_cut, end] = True
-        return arrays, lengths, layout
+        return arrays, lengths, begins, layout
 
     def _part(self, rollout, last=False) -> dict[str, torch.Tensor]:
         """Returns copies of steps (B, T, ...), or the last observation (B, 1, ...), as stored."""
@@ -309,7 +317,7 @@ class Waves:
         self.seconds = time.monotonic() - start
 
     def _check_room(self, folder, played, n_missing) -> None:
-        arrays, lengths, _ = played
+        arrays, lengths, *_ = played
         per_row = sum(leaf[0, 0].numel() * leaf.element_size() for leaf in arrays.values())
         needed = n_missing * (per_row * (lengths.mean() + 1) + 4096)
         free = shutil.disk_usage(folder).free
@@ -320,12 +328,15 @@ class Waves:
             )
 
     def _write(self, played, paths) -> None:
-        tensors, lengths, layout = played
+        tensors, lengths, begins, layout = played
         arrays = {name: leaf.numpy() for name, leaf in tensors.items()}
         for lane, path in paths.items():
-            rows = int(lengths[lane]) + 1
-            one = {name: array[lane, :rows] for name, array in arrays.items()}
+            rows = slice(int(begins[lane]), int(lengths[lane]) + 1)
+            one = {name: array[lane, rows] for name, array in arrays.items()}
+            for name in one if rows.start else ():
+                if name.startswith("action") or name in episodes.OUTCOMES:
+                    one[name][0] = 0  # as of all first rows
             if self.cfg.truth and layout is not None and self.homes:
                 one = episodes.with_plan(one, self.homes[layout[lane]])
             episodes.write(path, one)
-        self.n_steps += int(lengths[[*paths]].sum())
+        self.n_steps += int((lengths - begins)[[*paths]].sum())

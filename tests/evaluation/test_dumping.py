@@ -344,6 +344,16 @@ def test_minari_reads_every_array(twice, monkeypatch):
         assert np.array_equal(one.infos["walls"], file["walls"])
 
 
+def test_an_episode_begins_where_its_agent_joins(tmp_path):
+    words = "env=pettingzoo", "env.id=tests.helpers.odd_envs:Joins"
+    first, second = data.load(dumped(tmp_path / "npz", *words, n=2))
+    assert first.reward.tolist() == [1, 2, 3, 4, 5] and first.obs.flatten().tolist() == [*range(6)]
+    assert second.reward.tolist() == [3, 4, 5] and second.obs.flatten().tolist() == [2, 3, 4, 5]
+    assert second.truncated.tolist() == [False, False, True] and second.actions.shape == (3, 1)
+    row = np.load(tmp_path / "npz" / "episode-000001.npz")["action"]
+    assert row.sum(1).tolist() == [0, 1, 1, 1]
+
+
 def test_one_observation_without_a_name_and_a_dict_of_one_action(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     words = "env=gymnasium", "env.id=tests.helpers.odd_envs:OddOneKey-v0"

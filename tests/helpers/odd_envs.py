@@ -99,5 +99,30 @@ class BuildsRenderer(Odd):
         return self.frame
 
 
+class Joins:
+    """Two agents, as PettingZoo's; the second joins after 2 steps. They observe and earn the number
+    of steps, and are truncated after 5.
+    """
+
+    metadata, possible_agents = {"render_fps": 5}, ["first", "second"]
+
+    def observation_space(self, agent):
+        return spaces.Box(0, 9, (1,))
+
+    def action_space(self, agent):
+        return spaces.Discrete(3)
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.count = self.possible_agents[:1], 0
+        return {"first": np.zeros(1, np.float32)}, {}
+
+    def step(self, actions):
+        self.count += 1
+        self.agents = self.possible_agents[: 1 + (self.count >= 2)]
+        seen = {agent: np.full(1, self.count, np.float32) for agent in self.agents}
+        flags = dict.fromkeys(self.agents, False), dict.fromkeys(self.agents, self.count == 5)
+        return seen, dict.fromkeys(actions, float(self.count)), *flags, {}
+
+
 for _kind in [kind for kind in vars().values() if isinstance(kind, type) and issubclass(kind, Odd)]:
     gymnasium.register(f"Odd{_kind.__name__}-v0", _kind)
