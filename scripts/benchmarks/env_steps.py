@@ -51,7 +51,7 @@ def objects(device: torch.device) -> Iterator[dict]:
         "six discs": modules.Disc(6),
     }
     for n_envs in N_ENVS_WITH_OBJECTS[device.type]:
-        homes = sample("bench", N_HOMES)
+        homes = sample("bench", min(N_HOMES, n_envs))
         for name, kind in kinds.items():
             env = envs.Explorer(n_envs, homes, device=device, metrics=False)
             if kind is not None:

@@ -2,13 +2,14 @@
 
 import torch
 
-from megastep import envs, geometries, modules
+from megastep import envs, geometries, modules, scene
 
 __all__ = ["ENVS", "made"]
 
 
 def pushing(geometries, **settings):
     """Explorer with crates, balls and a ramp that the agent pushes, or drives up."""
+    geometries = scene.spread(geometries, settings["n_envs"])
     env = envs.Explorer(geometries=geometries, **settings)
     crate, ball = modules.Crate(6, 0.3, movable=True, width=0.2), modules.Disc(6, movable=True)
     kinds = {"crate": crate, "ball": ball, "ramp": modules.Ramp(4, 0.3, 0.3)}
