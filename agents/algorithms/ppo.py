@@ -28,6 +28,7 @@ from megastep.settings import checked
 
 _ROWS, _THREADS = LIBRARY.constants["JOINT_ROWS"], LIBRARY.constants["JOINT_THREADS"]
 _N_SUMS = LIBRARY.constants["N_JOINT_SUMS"]
+_MAX_WIDTH = 3072  # of features, whose weights fit into 99 KB: a block of any GPU may have that
 _PARTS = "starts", "actions", "logprobs", "mask"  # of a rollout, that a minibatch copies
 _COEFFICIENTS = "clip", "value_coef", "entropy_coef", "auxiliary_coef"
 _METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
@@ -137,8 +138,10 @@ def _takes_joint_loss(policy, batch, coefficients, has_errors, *_) -> bool:
     output, is_plain = policy.output, has_errors and not policy.critic.is_asymmetric
     is_few = type(output) is MultiDiscreteOutput and output.shape[0] == 1 and output.shape[1] <= 8
     is_known = is_plain and is_few and type(policy).terms is Policy.terms and "mask" not in batch
-    is_bf16 = policy.bf16 and policy.device.type == "cuda" and not policy.width % 32
-    return is_known and is_bf16 and torch.cuda.get_device_capability(policy.device) >= (8, 0)
+    is_bf16 = policy.bf16 and policy.device.type == "cuda"
+    if not is_known or not is_bf16 or policy.width % 32 or policy.width > _MAX_WIDTH:
+        return False
+    return torch.cuda.get_device_capability(policy.device) >= (8, 0)
 
 
 def _loss_on_gpu(**inputs) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:

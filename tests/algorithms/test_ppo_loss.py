@@ -9,6 +9,7 @@ from megastep.agents.algorithms import returns
 from megastep.agents.algorithms.ppo import ppo_loss
 from megastep.agents.networks import heads
 from megastep.agents.networks.critic import ValueOutput
+from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict
 
 T, M = 7, 133
@@ -140,3 +141,21 @@ def test_joint_loss_matches_heads_and_loss(sizes, to_gpu, monkeypatch):
     for i, (fused, plain) in enumerate(zip(*results, strict=True)):
         error = (fused.detach().float().cpu() - plain).norm() / plain.norm()
         assert error < 2.5e-2, (i, error)  # 8 bits
+
+
+class OnGpu(Policy):
+    device = property(lambda self: torch.device("cuda"))
+
+
+def test_joint_loss_is_for_weights_that_shared_memory_holds(monkeypatch):
+    """That of an RTX 3090 or 4090; a 3072 x 3072 policy takes too long to make."""
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8, 9))
+    vectors, choices = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 3)
+    policy = OnGpu(vectors, choices, width=32, core="none", critic="plain")
+    fitting = []
+    for policy.width in range(32, 8193, 32):
+        n_bytes = 32 * (policy.width + 2) + 4 * ppo_module._N_SUMS * ppo_module._THREADS // 32
+        if ppo_module._takes_joint_loss(policy, {}, {}, True):
+            assert n_bytes <= 99 * 1024
+            fitting.append(policy.width)
+    assert fitting == [*range(32, 3073, 32)]
