@@ -186,7 +186,8 @@ class Lanes:
 
         def converted(space, values) -> torch.Tensor:
             dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
-            values = torch.as_tensor(values).to(self._source, dtype, non_blocking=True)
+            may_follow = self._source.type == "cuda"  # the CPU reads what is there
+            values = torch.as_tensor(values).to(self._source, dtype, non_blocking=may_follow)
             return values.reshape(self.n_lanes, *space.shape).contiguous()
 
         return arrdict(actions=spaces.map(converted, self.env.action_space, actions))

@@ -209,3 +209,17 @@ class Interrupted:
         raise KeyboardInterrupt
 
     zero_ = __call__
+
+
+class Late(torch.Tensor):
+    """As on a GPU: a copy to the CPU that nobody waits for is not there yet."""
+
+    def to(self, *args, non_blocking=False):
+        there = self.as_subclass(torch.Tensor).to(*args, copy=True)
+        return torch.full_like(there, 7) if non_blocking else there
+
+
+def test_actions_on_a_gpu_are_waited_for_where_the_cpu_reads_them():
+    lanes = Lanes(Sums(), to_numpy=True)
+    actions = (torch.arange(N) % 3).as_subclass(Late)
+    assert lanes._decision(actions).actions[:, 0].tolist() == [0, 1, 2, 0, 1]
