@@ -155,34 +155,12 @@ def test_agents_may_leave_and_join():
     assert rows("truncated")[1] == [0, 1, 0] and rows("reset")[2] == [0, 1, 0]
 
 
-class Late(Relay):
-    """Agent three joins after a step. Observations are from 5 on."""
-
-    def observation_space(self, agent):
-        return spaces.Discrete(500, start=5)
-
-    def facts(self):
-        return {agent: np.int64(5 + self.value(agent)) for agent in self.agents}
-
-    def reset(self, seed=None, options=None):
-        super().reset()
-        self.agents = ["one", "two"]
-        return self.facts(), {}
-
-    def step(self, actions):
-        seen, *rest = super().step(actions)
-        if self.count == 1:
-            self.agents.append("three")
-            seen = {**seen, "three": np.int64(105)}
-        return seen, *rest
-
-
 def test_an_agent_that_is_not_there_yet_has_an_observation_of_its_space():
-    env = PettingZoo(1, id=f"{__name__}:Late", device="cpu")
-    actions = arrdict(actions=torch.arange(3)[:, None])
-    worlds = [env.reset(), *(env.step(actions) for _ in range(2))]
-    assert [world.obs[:, 0].tolist() for world in worlds] == [[0, 0, 0], [1, 10, 100], [1, 20, 200]]
-    assert [world.learns.tolist()[2] for world in worlds] == [False, True, True]
+    env = PettingZoo(1, id="tests.helpers.odd_envs:Joins", device="cpu")
+    actions = arrdict(actions=torch.zeros(2, 1, dtype=torch.int64))
+    worlds = [env.reset(), *(env.step(actions) for _ in range(3))]
+    assert [world.obs[:, 0].tolist() for world in worlds] == [[0, 0], [1, 0], [2, 2], [3, 3]]
+    assert [world.learns.tolist()[1] for world in worlds] == [False, False, True, True]
 
 
 class Turns(Relay):

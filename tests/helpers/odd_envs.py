@@ -100,26 +100,26 @@ class BuildsRenderer(Odd):
 
 
 class Joins:
-    """Two agents, as PettingZoo's; the second joins after 2 steps. They observe and earn the number
-    of steps, and are truncated after 5.
+    """Two agents, as PettingZoo's; the second joins after 2 steps. They earn the number of steps,
+    and observe it, from 5 on. Truncated after 5.
     """
 
     metadata, possible_agents = {"render_fps": 5}, ["first", "second"]
 
     def observation_space(self, agent):
-        return spaces.Box(0, 9, (1,))
+        return spaces.Discrete(9, start=5)
 
     def action_space(self, agent):
         return spaces.Discrete(3)
 
     def reset(self, seed=None, options=None):
         self.agents, self.count = self.possible_agents[:1], 0
-        return {"first": np.zeros(1, np.float32)}, {}
+        return {"first": np.int64(5)}, {}
 
     def step(self, actions):
         self.count += 1
         self.agents = self.possible_agents[: 1 + (self.count >= 2)]
-        seen = {agent: np.full(1, self.count, np.float32) for agent in self.agents}
+        seen = dict.fromkeys(self.agents, np.int64(5 + self.count))
         flags = dict.fromkeys(self.agents, False), dict.fromkeys(self.agents, self.count == 5)
         return seen, dict.fromkeys(actions, float(self.count)), *flags, {}
 
