@@ -13,12 +13,16 @@ import torch
 from megastep.kernels.build import launch
 
 _THREAD = threading.local()  # its `work` waits for a sequence to run beside
+#: The latest gradient's event and version, until a sequence asks for any.
+_latest: tuple[torch.cuda.Event | None, int] | None = None
 
 
 @functools.cache
-def _stream(device) -> torch.cuda.Stream:
-    # above others, so that clusters of blocks find neighbouring multiprocessors that are free
-    return torch.cuda.Stream(device, priority=-1)
+def _second_of(stream) -> torch.cuda.Stream:
+    """Each stream has its own, since what is freed there waits for this stream alone. It is above
+    others, so that clusters of blocks find neighbouring multiprocessors that are free.
+    """
+    return torch.cuda.Stream(stream.device, priority=-1)
 
 
 def now(device: torch.device) -> torch.cuda.Event | None:
@@ -43,7 +47,8 @@ def second_stream(
     if after is None:
         yield lambda: None
         return
-    current, stream = torch.cuda.current_stream(device), _stream(device)
+    current = torch.cuda.current_stream(device)
+    stream = _second_of(current)
     stream.wait_event(after)
     with torch.cuda.stream(stream):
         yield lambda: current.wait_stream(stream)
@@ -72,17 +77,21 @@ def waiting() -> Callable[[], object] | None:
 
 def mark(gradient: torch.Tensor) -> torch.Tensor:
     """Returns a gradient, and keeps with it that it is computed `now`; see `ready`."""
-    gradient.ready = now(gradient.device), gradient._version  # pyright: ignore[reportAttributeAccessIssue]
+    global _latest
+    _latest = gradient.ready = now(gradient.device), gradient._version  # pyright: ignore[reportAttributeAccessIssue]
     return gradient
 
 
 def ready(gradient: torch.Tensor) -> torch.cuda.Event | None:
-    """Returns when a marked gradient was computed, to the first who asks. None: unknown, or
-    something was added to it since.
+    """Returns when the gradient that was marked last was computed, to the first who asks for any.
+    None: it is another, or something was added to it since.
 
-    Who asks second waits for the current stream, which still reads what the first computed on the
-    second stream, and has freed there.
+    Who gets None waits for the current stream, which may still read what was computed on the second
+    stream after the mark, and has been freed there.
     """
-    event, version = getattr(gradient, "ready", (None, 0))
-    gradient.ready = None, 0  # pyright: ignore[reportAttributeAccessIssue]
+    global _latest
+    latest, _latest = _latest, None
+    if latest is None or getattr(gradient, "ready", None) is not latest:
+        return None
+    event, version = latest
     return event if version == gradient._version else None

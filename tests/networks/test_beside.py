@@ -1,5 +1,8 @@
 """Work on a second stream beside an LSTM's sequence."""
 
+import contextlib
+from typing import cast
+
 import pytest
 import torch
 
@@ -51,6 +54,40 @@ def test_a_gradient_is_ready_for_one_reader_if_nothing_is_added_to_it(monkeypatc
     terms = [Marked.apply(y), *[y.square()] * (other != "none")]
     sum(term.sum() for term in (terms if other == "after" else terms[::-1])).backward()
     assert found == ["an event" if other == "none" else None, None]
+
+
+def test_only_the_latest_gradient_is_ready(monkeypatch):
+    """For an earlier one, what was freed since may still be read."""
+    monkeypatch.setattr(beside, "now", lambda device: "an event")
+    first, second = (beside.mark(torch.ones(3)) for _ in range(2))
+    assert [beside.ready(gradient) for gradient in (second, first)] == ["an event", None]
+
+
+class Stream:
+    """Stands for one of a GPU."""
+
+    def __init__(self, device="cuda", priority=0):
+        self.device, self.waited_for = device, []
+
+    def wait_event(self, event):
+        self.waited_for.append(event)
+
+    wait_stream = wait_event
+
+
+def test_each_stream_has_its_own_second_one(monkeypatch):
+    """Memory freed on it would go to another stream, which does not wait for the first."""
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "stream", contextlib.nullcontext)
+    streams, event = [Stream(), Stream()], cast(torch.cuda.Event, "an event")
+    for current in (*streams, *streams):
+        monkeypatch.setattr(torch.cuda, "current_stream", lambda device, stream=current: stream)
+        with beside.second_stream(torch.device("cuda"), event) as join:
+            pass
+        join()
+    seconds = [stream.waited_for for stream in streams]
+    assert [len(set(each)) for each in seconds] == [1, 1] and seconds[0][0] is not seconds[1][0]
+    assert all(each[0].waited_for == [event] * 2 for each in seconds)
 
 
 @pytest.mark.cuda
