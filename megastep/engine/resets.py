@@ -102,9 +102,13 @@ class Resets:
         parts, now = [], walk(env, torch.Tensor)
         for path, leaf, axis in rows:
             parent, step, own = now.get(path, (None, "", leaf))
-            parts.append((leaf, axis, leaf if own is leaf else own.clone()))
+            values = leaf if own is leaf else own.clone()
             if own is not leaf:  # replaced, as by `self.age = self.age + 1`
-                rebind(parent, step, leaf)
+                try:
+                    rebind(parent, step, leaf)
+                except (TypeError, AttributeError):  # with its tuple, or frozen dataclass
+                    leaf = own
+            parts.append((leaf, axis, values))
         parts += [(leaf, 0, own) for leaf, own in zip(leaves, fresh, strict=True)]
         for (leaf, axis, own), old in zip(parts, before, strict=True):
             torch.where(_along(began, env.n_envs, leaf, axis), own, old, out=leaf)

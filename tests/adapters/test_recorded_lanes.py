@@ -64,16 +64,16 @@ def recorded(same_step, monkeypatch):
 
 
 class Replaces(Sums):
-    """Replaces its tensors in each step, those of a dict with the dict."""
+    """Replaces its tensors in each step, those of a dict and of a tuple with these."""
 
     def __init__(self):
         super().__init__()
-        self.state = {"sums": self.sums}
+        self.state, self.pair = {"sums": self.sums}, (self.ages, self.counts)
 
     def world(self, actions):
-        self.ages, self.counts, self.ended = self.ages + 0, self.counts + 0, self.ended.clone()
+        (self.ages, self.counts), self.ended = (leaf + 0 for leaf in self.pair), self.ended.clone()
         self.sums = self.state["sums"].clone()
-        self.state = {"sums": self.sums}
+        self.state, self.pair = {"sums": self.sums}, (self.ages, self.counts)
         return super().world(actions)
 
 
