@@ -160,6 +160,7 @@ class Graph:
 
     A call copies the tensors of its arguments in, on the CPU into page-locked memory, replays it,
     and returns the outputs, valid until the next call. The tensors of ``roots`` live as long as it.
+    It may still read arguments on the CPU when it returns: wait for it before the next call.
     """
 
     IS_STATELESS = True  # its tensors are copies, see :func:`megastep.engine.state_tree.walk`
