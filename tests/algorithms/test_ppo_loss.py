@@ -6,11 +6,14 @@ import torch
 from megastep import spaces
 from megastep.agents.algorithms import ppo as ppo_module
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.ppo import ppo_loss
-from megastep.agents.networks import heads
+from megastep.agents.algorithms.ppo import PPO, ppo_loss
+from megastep.agents.networks import heads, linear
 from megastep.agents.networks.critic import ValueOutput
 from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
+from megastep.kernels.build.launch import launch
+from tests.helpers.made_up import MOVES, OBS
 
 T, M = 7, 133
 
@@ -159,3 +162,44 @@ def test_joint_loss_is_for_weights_that_shared_memory_holds(monkeypatch):
             assert n_bytes <= 99 * 1024
             fitting.append(policy.width)
     assert fitting == [*range(32, 3073, 32)]
+
+
+@pytest.mark.parametrize("learning", (1.0, 0.5, 0.0))
+def test_an_update_by_joint_loss_has_the_gradients_of_a_plain_one(
+    learning, cuda_on_cpu, monkeypatch
+):
+    """Where all lanes learn, some or none; metrics too."""
+
+    def on_cpu(library, operation, device, shape, /, **fields):
+        is_ours = operation in ("joint_loss", "sum_rows")
+        (cuda_on_cpu if is_ours else launch)(library, operation, device, shape, **fields)
+
+    results = []
+    for loss_of_policy in (ppo_module._loss_of, ppo_module._joint_loss):
+        torch.manual_seed(1)
+        policy = Policy(OBS, MOVES, width=64, core="mingru", critic="plain")
+        policy.output.linear.weight.data.mul_(100)
+        rollout = Rollout(T, M, OBS, MOVES, policy.initial(M), "cpu")
+        for leaf in (rollout.obs, rollout.reward, rollout.values):
+            leaf.normal_()
+        rollout.actions.random_(MOVES.n_actions)
+        rollout.logprobs.fill_(-1)
+        rollout.learns.copy_(torch.rand(M) < learning)
+        learner = PPO(policy, n_minibatches=1, entropy_coef=0.1)
+        with monkeypatch.context() as patch:
+            patch.setattr(ppo_module, "gradient_of_weights", lambda d, x: d.float().T @ x.float())
+            for module in (ppo_module, linear):
+                patch.setattr(module, "launch", on_cpu)
+            patch.setattr(ppo_module, "_loss_of", loss_of_policy)
+            metrics = learner.update(rollout)
+        results.append((metrics, [leaf.grad for leaf in policy.parameters()]))
+    assert "joint_loss" in cuda_on_cpu.launched
+    (metrics, gradients), (joint_metrics, joint_gradients) = results
+    assert metrics.keys() == joint_metrics.keys()
+    close = dict(rtol=1e-2, atol=1e-2, equal_nan=True)
+    for name, value in metrics.items():
+        torch.testing.assert_close(joint_metrics[name], value, **close)
+    for joint, plain in zip(joint_gradients, gradients, strict=True):
+        assert joint.dtype == plain.dtype and joint.shape == plain.shape
+        assert (joint - plain).norm() <= 2e-2 * plain.norm() + 2e-4  # a sum of many
+        assert plain.any() == (learning > 0)
