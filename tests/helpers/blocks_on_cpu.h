@@ -79,6 +79,7 @@ struct Fiber {
 static Fiber fibers[MAX_FIBERS];
 static std::vector<Job> jobs;  // of no fiber
 static bool is_late;           // whether jobs are done as late as they may be, or at once
+static bool is_mixed;          // whether some are late
 static jmp_buf scheduler;
 static int current, n_fibers, n_threads_of_block;
 static unsigned int first_block;
@@ -132,25 +133,29 @@ static void resume() {
     setcontext(&start);
 }
 
-// Jobs that are late are done when nothing else can be.
-static void do_jobs() {
-    std::vector<Job> all;
-    all.swap(jobs);
-    for (Job& job : all)
-        job();
-}
-
-// In which order warps, and the threads of each, run. A warp runs until none of its threads gets
-// on while all others stand still; if shuffled, often only part of the way. Every launch is
-// shuffled alike, so that a failure comes again.
-enum class Order { FORWARD, REVERSED, SHUFFLED };
-
 static unsigned int random_bits;
 
 static unsigned int random_below(unsigned int n) {
     random_bits = random_bits * 1664525u + 1013904223u;
     return (unsigned int)((Bits64)random_bits * n >> 32);
 }
+
+// Jobs that are late are done when nothing else can be; some later still if they are mixed.
+static void do_jobs() {
+    std::vector<Job> all;
+    all.swap(jobs);
+    for (Job& job : all) {
+        if (is_mixed && random_below(2))
+            jobs.push_back(job);
+        else
+            job();
+    }
+}
+
+// In which order warps, and the threads of each, run. A warp runs until none of its threads gets
+// on while all others stand still; if shuffled, often only part of the way. Every launch is
+// shuffled alike, so that a failure comes again.
+enum class Order { FORWARD, REVERSED, SHUFFLED };
 
 static void shuffle_numbers(std::vector<int>& numbers) {
     for (size_t i = numbers.size(); i > 1; i--)
@@ -207,7 +212,7 @@ static void run_cluster(Order order) {
             snprintf(failure, sizeof failure, "block %u: its threads wait for each other",
                      blockIdx.x);
     }
-    if (!failure[0])
+    while (!jobs.empty() && !failure[0])
         do_jobs();  // which come too late, and say so
     if (failure[0])
         for (Fiber& fiber : fibers)
@@ -446,6 +451,7 @@ const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned
     n_fibers = (int)(cluster * n_threads);
     n_threads_of_block = (int)n_threads;
     is_late = jobs_are_late;
+    is_mixed = is_late && order == Order::SHUFFLED;
     random_bits = 0;
     blockDim = {n_threads, 1};
     gridDim = {n_blocks_x, n_blocks_y};

@@ -78,7 +78,7 @@ class CudaOnCpu:
     Attributes:
         order: in which threads run, one of `ORDERS`.
         is_late: copies to shared memory, and what blocks of a cluster send each other, arrive as
-            late as they may, and not at once.
+            late as they may, and not at once; some of them, if threads are shuffled.
         launched: the operations since `install`.
     """
 

@@ -1,6 +1,7 @@
 // What common/tensor_cores.h has, for kernels that blocks_on_cpu.h runs on a CPU. A GPU copies and
-// sends in its own time. Here it is done at once, or as late as it may be (`is_late`): whoever
-// reads too early, or overwrites what is still to be read, gets other numbers in one of the two.
+// sends in its own time. Here it is done at once, as late as it may be (`is_late`), or either
+// (`is_mixed`): whoever reads too early, or overwrites what is still to be read, gets other numbers
+// in one of these.
 // What a barrier makes visible is not modelled, and loads and products of matrices are barriers of
 // a warp.
 #pragma once
@@ -124,7 +125,7 @@ DEVICE void multiply_add(float (&sum)[4], const unsigned int (&a)[4], unsigned i
 // ---- Copies and clusters ----
 
 DEVICE void begin_job(std::vector<Job>& list, Job job) {
-    if (is_late)
+    if (is_late && !(is_mixed && random_below(2)))
         list.push_back(job);
     else
         job();

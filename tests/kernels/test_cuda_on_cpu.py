@@ -126,17 +126,19 @@ extern __shared__ __align__(16) unsigned char shared_memory[];
 KERNEL BOUNDS(2) exchange(NumbersParams p) {
     wait_for_previous();
     Arrivals* arrivals = (Arrivals*)shared_memory;
-    float* received = (float*)shared_memory + 4;
+    float *received = (float*)shared_memory + 4, *sent = received + 4 * 64;
     if (!threadIdx.x) {
         init(arrivals);
-        expect(arrivals, 64 * 8);
+        expect(arrivals, 64 * 16);
     }
     cluster_barrier();
     int i = blockIdx.x * 64 + threadIdx.x, other = 1 - cluster_rank();
-    send(address_in(received + 2 * threadIdx.x, other), p.before[i], 0.f,
+    sent[4 * threadIdx.x] = p.before[i];
+    publish();
+    send(address_in(received + 4 * threadIdx.x, other), sent + 4 * threadIdx.x, 16,
          address_in(arrivals, other));
     wait_for(arrivals, 0);
-    p.after[i] = (int)received[2 * (63 - threadIdx.x)];
+    p.after[i] = (int)received[4 * (63 - threadIdx.x)];
 }
 """
 
@@ -147,7 +149,7 @@ KERNEL BOUNDS(2) exchange(NumbersParams p) {
     [
         ("", None),
         ("wait_for(arrivals, 0);", "something arrives after its end"),
-        ("expect(arrivals, 64 * 8);", "its threads wait for each other"),
+        ("expect(arrivals, 64 * 16);", "its threads wait for each other"),
     ],
 )
 def test_blocks_of_a_cluster_send_each_other_numbers(built, missing, message, order, is_late):
@@ -157,7 +159,7 @@ def test_blocks_of_a_cluster_send_each_other_numbers(built, missing, message, or
     after = torch.full_like(before, -1)
 
     def run():
-        launch(library, "exchange", CPU, Blocks(4, shared=1024), before=before, after=after, n=256)
+        launch(library, "exchange", CPU, Blocks(4, shared=4096), before=before, after=after, n=256)
         return [after.clone()]
 
     if not message:
