@@ -91,13 +91,13 @@ def test_each_stream_has_its_own_second_one(monkeypatch):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("layers", [1, 2])
-def test_an_update_is_the_same_on_one_stream(layers):
+@pytest.mark.parametrize("layers, width", [(1, 256), (2, 256), (1, 128)])
+def test_an_update_is_the_same_on_one_stream(layers, width):
     """Where streams share a GPU there is no second one."""
     privileged, n_lanes, ends = spaces.MultiVector(1, 12), 4096, []
     for is_shared in (True, False):
         torch.manual_seed(1)
-        policy = Policy(OBS, MOVES, privileged, width=256, layers=layers).cuda()
+        policy = Policy(OBS, MOVES, privileged, width=width, layers=layers).cuda()
         state = policy.initial(n_lanes)
         rollout = Rollout(16, n_lanes, OBS, MOVES, state, "cuda", privileged)
         for leaf in (rollout.obs, rollout.privileged, rollout.reward):
