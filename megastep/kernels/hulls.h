@@ -29,7 +29,7 @@ HD Hull hull_of(const Float4& wall) {
 HD float half_width_of(const ObjectsParams& o, int k, float size) {
     if (o.shapes[k] == DISC)
         return -1.f;
-    return o.shapes[k] == DOOR ? 0.f : -size * LOAD((const Float4*)o.ends + lines_of(o, k).first).y;
+    return o.shapes[k] == DOOR ? 0.f : -size * first_y_of(o, k);
 }
 
 // Where hulls a and b come within reach of each other: at up to two points along one normal, from a

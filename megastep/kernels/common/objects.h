@@ -108,11 +108,16 @@ HD Float4 line_at(const Float4& ends, float size, const Pose& pose) {
 
 HD Range lines_of(const ObjectsParams& o, int k) { return range_of(o.line_starts, k, o.n_lines); }
 
+// Where the first line of a rectangle begins, in its sizes: half its width to the right.
+HD float first_y_of(const ObjectsParams& o, int k) {
+    return LOAD((const Float4*)o.ends + mini(lines_of(o, k).first, o.n_lines - 1)).y;
+}
+
 // Half the diagonal of object k, if it is a body, since bodies never overlap; else its size.
 HD float radius_of(const ObjectsParams& o, int k, float size) {
     if (o.n_bodies == 0 || o.object_bodies[k] < 0 || o.shapes[k] == DISC)
         return size;
-    float half = LOAD((const Float4*)o.ends + lines_of(o, k).first).y;
+    float half = first_y_of(o, k);
     return size * SQRT(1.f + half * half);
 }
 

@@ -76,7 +76,7 @@ HD void start_episode(const HideAndSeekStepParams& p, int env, int layout) {
 HD Float4 nearest_point(const ObjectsParams& o, int k, const Object& object, float x, float y) {
     Pose pose = pose_at(object.x, object.y, object.angle);
     float dx = x - object.x, dy = y - object.y;
-    float half = -object.size * LOAD((const Float4*)o.ends + lines_of(o, k).first).y;
+    float half = -object.size * first_y_of(o, k);
     float along = pose.cosine * dx + pose.sine * dy, aside = pose.cosine * dy - pose.sine * dx;
     float back = clamp(along, -object.size, object.size) - along,
           side = clamp(aside, -half, half) - aside;
