@@ -85,7 +85,8 @@ def ppo(device: torch.device) -> Iterator[dict]:
     """
     for run in RUNS[device.type]:
         env = _environment(run, device)
-        learner = PPO(Policy(env, **run.agent), n_steps=run.steps, n_minibatches=run.minibatches)
+        sizes = dict(n_steps=run.steps, n_minibatches=run.minibatches)
+        learner = PPO(Policy(env, **run.agent), **sizes, graph=True)
         collect = learner.collector(env)
 
         def iterate(learner=learner, collect=collect):
