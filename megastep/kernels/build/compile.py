@@ -200,7 +200,8 @@ def cuda(library: KernelLibrary, index: int) -> dict[str, object]:
         return {}
     driver, _ = bindings()
     major, minor = torch.cuda.get_device_capability(index)
-    cubin = build_cuda(library, f"sm_{major}{minor}")
+    # a Hopper's own instructions, too
+    cubin = build_cuda(library, f"sm_{major}{minor}{'a' * ((major, minor) == (9, 0))}")
     loading = "Loading the GPU's kernels"
     with torch.cuda.device(index):
         torch.cuda.current_stream().synchronize()  # makes the device's primary context current

@@ -92,6 +92,45 @@ DEVICE void multiply_add(float (&sum)[4], const unsigned int (&a)[4], unsigned i
         : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
 }
 
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL
+
+// Products of the four warps of a group, which are begun one after the other (wgmma).
+constexpr int GROUP_ROWS = 64;
+
+// A matrix of rows of 64 numbers at a multiple of 1,024 bytes, whose eight words of 16 bytes are
+// swizzled: word i of row r is at i ^ r % 8. Words i on are at the matrix + i.
+DEVICE unsigned long long swizzled_matrix(const void* first) {
+    constexpr unsigned long long EIGHT_ROWS = 1024 / 16, SWIZZLE_128 = 1;
+    unsigned int address = (unsigned int)__cvta_generic_to_shared(first);
+    return address / 16 | EIGHT_ROWS << 32 | SWIZZLE_128 << 62;
+}
+
+DEVICE void begin_multiplying() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
+
+// Waits until all sums are there.
+DEVICE void end_multiplying() {
+    asm volatile("wgmma.commit_group.sync.aligned;\nwgmma.wait_group.sync.aligned 0;" ::: "memory");
+}
+
+#define FOUR(i) "+f"(sums[i][0]), "+f"(sums[i][1]), "+f"(sums[i][2]), "+f"(sums[i][3])
+
+// sums (64 x 128) += a (64 x 16) b (16 x 128): the next two words of 64 rows and of 128 rows. A
+// thread has numbers 2 q and 2 q + 1 of each 8 columns, of row g of its warp's 16 and of row g + 8.
+DEVICE void multiply_add(float (&sums)[16][4], unsigned long long a, unsigned long long b) {
+    asm volatile(
+        "wgmma.mma_async.sync.aligned.m64n128k16.f32.bf16.bf16 {"
+        "%0, %1, %2, %3, %4, %5, %6, %7, %8, %9, %10, %11, %12, %13, %14, %15, "
+        "%16, %17, %18, %19, %20, %21, %22, %23, %24, %25, %26, %27, %28, %29, %30, %31, "
+        "%32, %33, %34, %35, %36, %37, %38, %39, %40, %41, %42, %43, %44, %45, %46, %47, "
+        "%48, %49, %50, %51, %52, %53, %54, %55, %56, %57, %58, %59, %60, %61, %62, %63}, "
+        "%64, %65, 1, 1, 1, 0, 0;"
+        : FOUR(0), FOUR(1), FOUR(2), FOUR(3), FOUR(4), FOUR(5), FOUR(6), FOUR(7), FOUR(8), FOUR(9),
+          FOUR(10), FOUR(11), FOUR(12), FOUR(13), FOUR(14), FOUR(15)
+        : "l"(a), "l"(b));
+}
+
+#endif
+
 // ---- Copies and clusters ----
 
 // Begins to copy 16 bytes from global to shared memory.

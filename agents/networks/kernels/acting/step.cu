@@ -6,27 +6,26 @@
 // multiplied. An LSTM's parts are first those of the last outputs, then those of x. The part with
 // the block's own units of x is the last, as x is added to its outputs.
 //
-// A warp computes 64 rows of the weights for 32 lanes. Of a 16 x 8 result, a thread holds lanes g
-// and g + 8 and units 2 q and 2 q + 1, with g = thread / 4 and q = thread % 4 of the warp. It holds
-// all gates of a unit.
+// A warp has the results of 16 lanes; four warps multiply together on a Hopper (wgmma). Of a 16 x 8
+// result, a thread holds lanes g and g + 8 and units 2 q and 2 q + 1, with g = thread / 4 and
+// q = thread % 4 of the warp. It holds all gates of a unit.
 //
 // In shared memory, a row of a part, of a lane or of a weight, has eight words of 16 bytes. Word i
-// of row r is at i ^ r % 8, so that words i of eight rows are in different banks.
+// of row r is at i ^ r % 8, so that words i of eight rows are in different banks. A Hopper calls
+// this a swizzle of 128 bytes, and wants parts at multiples of 1,024 bytes.
 #include "common/tensor_cores.h"
 #include "params.h"
 
-constexpr int WARP_LANES = 32;
-constexpr int LANE_TILES = WARP_LANES / 16;  // of a warp's results
+constexpr int WARP_LANES = 16;
 constexpr int WORD = 16;                     // bytes
 constexpr int WORD_NUMBERS = 8;              // of a word
 constexpr int ROW_BYTES = 2 * INNER;         // of a part
 constexpr int ROW_WORDS = ROW_BYTES / WORD;  // of a part
 constexpr int STAGE_BYTES = (LANES + ROWS) * ROW_BYTES;
 
-static_assert(THREADS == 32 * (LANES / WARP_LANES) * 2,
-              "two warps have the rows of a warp's lanes");
+static_assert(THREADS == 32 * LANES / WARP_LANES, "a warp for each 16 lanes");
 
-extern __shared__ __align__(128) unsigned char shared_memory[];
+extern __shared__ __align__(1024) unsigned char shared_memory[];
 
 // The minGRU's update gate after activation, with the same bits as in the kernel that learns; see
 // mingru.cu.
@@ -38,27 +37,26 @@ DEVICE int word_at(int row, int word) { return row * ROW_BYTES + (word ^ (row & 
 
 template <int N_GATES>
 struct Block {
-    static constexpr int GATES = N_GATES;
-    static constexpr int UNITS = ROWS / GATES, WARP_UNITS = UNITS / 2;
-    static constexpr int UNIT_TILES = WARP_UNITS / 8;     // of a gate's results
+    static constexpr int GATES = N_GATES, UNITS = ROWS / GATES;
+    static constexpr int UNIT_TILES = UNITS / 8;          // of a gate's results
     static constexpr int STATE_WORDS = 4 * UNITS / WORD;  // of a lane
     static constexpr bool HAS_OUTPUT = GATES == 4;        // which is multiplied, too
 
-    int first_lane, first_unit;  // of the block
-    int lanes, units;            // the warp's first, in the block
+    int first_lane, first_unit;
+    int lanes;  // the warp's first, in the block
 };
 
 template <class B>
 DEVICE B find_block(const StepParams& p) {
-    int per_row = p.width / B::UNITS, warp = threadIdx.x / 32;
-    return {LANES * ((int)blockIdx.x / per_row), B::UNITS * ((int)blockIdx.x % per_row),
-            warp / 2 * WARP_LANES, warp % 2 * B::WARP_UNITS};
+    int per_row = p.width / B::UNITS, block = blockIdx.x;
+    return {LANES * (block / per_row), B::UNITS * (block % per_row),
+            (int)threadIdx.x / 32 * WARP_LANES};
 }
 
-// The word of the warp's first unit in a row of the last part.
+// The word of the block's first unit in a row of the last part.
 template <class B>
 DEVICE int own_word(const B& block) {
-    return (block.first_unit % INNER + block.units) / WORD_NUMBERS;
+    return block.first_unit % INNER / WORD_NUMBERS;
 }
 
 // A lane of the block. One that does not exist is the last one.
@@ -67,10 +65,10 @@ DEVICE int lane_of(const B& block, int lane, const StepParams& p) {
     return min(block.first_lane + lane, p.n_lanes - 1);
 }
 
-// A thread's sums: by tile of lanes, gate and tile of units.
+// A thread's sums: by gate and tile of units.
 template <class B>
 struct Sums {
-    float of[LANE_TILES][B::GATES][B::UNIT_TILES][4];
+    float of[B::GATES][B::UNIT_TILES][4];
 };
 
 // Begins to copy a part's rows of lanes and of weights. `resets` has a bit for each lane that this
@@ -122,16 +120,29 @@ DEVICE void begin_states(unsigned char* states, const B& block, const StepParams
 
 template <class B>
 DEVICE void begin_sums(Sums<B>& sums, const B& block, const StepParams& p) {
-    const Bits* bias = (const Bits*)p.bias + block.first_unit + block.units + threadIdx.x % 4 * 2;
+    const Bits* bias = (const Bits*)p.bias + block.first_unit + threadIdx.x % 4 * 2;
     for (int gate = 0; gate < B::GATES; gate++)
         for (int j = 0; j < B::UNIT_TILES; j++) {
             unsigned int pair = *(const unsigned int*)(bias + gate * p.width + 8 * j);
-            for (int m = 0; m < LANE_TILES; m++) {
-                sums.of[m][gate][j][0] = sums.of[m][gate][j][2] = low_half(pair);
-                sums.of[m][gate][j][1] = sums.of[m][gate][j][3] = high_half(pair);
-            }
+            sums.of[gate][j][0] = sums.of[gate][j][2] = low_half(pair);
+            sums.of[gate][j][1] = sums.of[gate][j][3] = high_half(pair);
         }
 }
+
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL  // a Hopper
+
+template <class B>
+DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& block) {
+    const unsigned char* lanes = part + block.lanes / GROUP_ROWS * GROUP_ROWS * ROW_BYTES;
+    unsigned long long left = swizzled_matrix(lanes);
+    unsigned long long right = swizzled_matrix(part + LANES * ROW_BYTES);
+    begin_multiplying();
+    for (int k = 0; k < ROW_WORDS; k += 2)
+        multiply_add((float (&)[ROWS / 8][4]) sums, left + k, right + k);
+    end_multiplying();
+}
+
+#else
 
 template <class B>
 DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& block) {
@@ -139,22 +150,21 @@ DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& blo
     // A thread gives the row of a matrix: of the lanes, matrices go down first, then right; of the
     // weights the other way round.
     int left_at = word_at(block.lanes + thread % 16, thread / 16);
-    int right_at = word_at(LANES + block.units + thread / 16 * 8 + thread % 8, thread / 8 % 2);
+    int right_at = word_at(LANES + thread / 16 * 8 + thread % 8, thread / 8 % 2);
     for (int k = 0; k < ROW_WORDS; k += 2) {
-        unsigned int left[LANE_TILES][4], right[B::GATES][B::UNIT_TILES][2];
-        for (int m = 0; m < LANE_TILES; m++)
-            load_matrices(left[m], part + (left_at ^ k * WORD) + 16 * m * ROW_BYTES);
+        unsigned int left[4], right[2][2];
+        load_matrices(left, part + (left_at ^ k * WORD));
         for (int gate = 0; gate < B::GATES; gate++)
-            for (int j = 0; j < B::UNIT_TILES; j += 2)
-                load_matrices(right[gate][j], right[gate][j + 1],
-                              part + (right_at ^ k * WORD) + (gate * B::UNITS + 8 * j) * ROW_BYTES);
-        for (int m = 0; m < LANE_TILES; m++)
-            for (int gate = 0; gate < B::GATES; gate++)
-                for (int j = 0; j < B::UNIT_TILES; j++)
-                    multiply_add(sums.of[m][gate][j], left[m], right[gate][j][0],
-                                 right[gate][j][1]);
+            for (int j = 0; j < B::UNIT_TILES; j += 2) {
+                const unsigned char* rows = part + (gate * B::UNITS + 8 * j) * ROW_BYTES;
+                load_matrices(right[0], right[1], rows + (right_at ^ k * WORD));
+                for (int i = 0; i < 2; i++)
+                    multiply_add(sums.of[gate][j + i], left, right[i][0], right[i][1]);
+            }
     }
 }
+
+#endif
 
 // The next state and output, without the residual, of one unit, from number e of the thread's sums
 // of a tile.
@@ -179,32 +189,32 @@ template <class B>
 DEVICE void update(const Sums<B>& sums, unsigned char* part, unsigned char* states,
                    unsigned char* plain, const B& block, const StepParams& p) {
     int thread = threadIdx.x % 32, g = thread / 4, q = thread % 4;
-    // of a lane of the warp for each thread
-    unsigned int resets = __ballot_sync(~0u, p.reset[lane_of(block, block.lanes + thread, p)] != 0);
+    // of a lane of the warp for each thread, twice
+    int lane = lane_of(block, block.lanes + thread % WARP_LANES, p);
+    unsigned int resets = __ballot_sync(~0u, p.reset[lane] != 0);
     unsigned int residual_mask = 0u - p.is_residual;
     int first_output = word_at(block.lanes + g, own_word(block)) + 4 * q;
     // words 2 j on are in the order of word 0, as with outputs
-    int first_state = state_at<B>(block.lanes + g, block.units / 4 + q / 2) + q % 2 * 8;
+    int first_state = state_at<B>(block.lanes + g, q / 2) + q % 2 * 8;
 #pragma unroll
-    for (int m = 0; m < LANE_TILES; m++)
-        for (int half = 0; half < 2; half++) {
-            int row = 16 * m + 8 * half;  // and g
-            bool is_reset = resets >> (row + g) & 1;
-            for (int j = 0; j < B::UNIT_TILES; j++) {
-                auto& state =
-                    *(float2*)(states + (first_state ^ 2 * j * WORD) + row * B::STATE_WORDS * WORD);
-                auto& output = *(unsigned int*)(part + (first_output ^ j * WORD) + row * ROW_BYTES);
-                float2 now = is_reset ? float2{0.f, 0.f} : state;
-                float x = next<B>(now.x, sums.of[m], j, 2 * half);
-                float y = next<B>(now.y, sums.of[m], j, 2 * half + 1);
-                state = now;
-                if (B::HAS_OUTPUT)
-                    *(unsigned int*)(plain + (first_output ^ j * WORD) + row * ROW_BYTES) =
-                        pack_bfloat16(x, y);
-                unsigned int residual = output & residual_mask;
-                output = pack_bfloat16(low_half(residual) + x, high_half(residual) + y);
-            }
+    for (int half = 0; half < 2; half++) {
+        int row = 8 * half;  // and g
+        bool is_reset = resets >> (row + g) & 1;
+        for (int j = 0; j < B::UNIT_TILES; j++) {
+            auto& state =
+                *(float2*)(states + (first_state ^ 2 * j * WORD) + row * B::STATE_WORDS * WORD);
+            auto& output = *(unsigned int*)(part + (first_output ^ j * WORD) + row * ROW_BYTES);
+            float2 now = is_reset ? float2{0.f, 0.f} : state;
+            float x = next<B>(now.x, sums.of, j, 2 * half);
+            float y = next<B>(now.y, sums.of, j, 2 * half + 1);
+            state = now;
+            if (B::HAS_OUTPUT)
+                *(unsigned int*)(plain + (first_output ^ j * WORD) + row * ROW_BYTES) =
+                    pack_bfloat16(x, y);
+            unsigned int residual = output & residual_mask;
+            output = pack_bfloat16(low_half(residual) + x, high_half(residual) + y);
         }
+    }
 }
 
 // Copies words of the warp's lanes to GPU memory: WORDS of a lane, `stride` bytes from one to the
@@ -227,18 +237,15 @@ DEVICE void write_outputs(void* outputs, const unsigned char* part, const B& blo
         return word_at(block.lanes + lane, own_word(block) + word);
     };
     int n_lanes = p.n_lanes - block.first_lane - block.lanes;
-    write_words<B::WARP_UNITS / WORD_NUMBERS>((Bits*)outputs + first, 2ll * p.width, part, n_lanes,
-                                              at);
+    write_words<B::UNITS / WORD_NUMBERS>((Bits*)outputs + first, 2ll * p.width, part, n_lanes, at);
 }
 
 template <class B>
 DEVICE void write_states(const unsigned char* states, const B& block, long long first,
                          const StepParams& p) {
-    auto at = [&](int lane, int word) {
-        return state_at<B>(block.lanes + lane, block.units / 4 + word);
-    };
+    auto at = [&](int lane, int word) { return state_at<B>(block.lanes + lane, word); };
     int n_lanes = p.n_lanes - block.first_lane - block.lanes;
-    write_words<B::STATE_WORDS / 2>(p.next_state + first, 4ll * p.width, states, n_lanes, at);
+    write_words<B::STATE_WORDS>(p.next_state + first, 4ll * p.width, states, n_lanes, at);
 }
 
 template <int GATES>
@@ -268,6 +275,7 @@ DEVICE void step(const StepParams& p) {
 #pragma unroll 1  // keeps the code short
     for (int i = 0; i < n_parts; i++) {
         wait_for_copies<STAGES - 2>();
+        publish();
         __syncthreads();  // the part is here, and no warp reads the one before any more
         begin(i + STAGES - 1);
         multiply_part(sums, stage(i), block);
@@ -278,7 +286,7 @@ DEVICE void step(const StepParams& p) {
     update(sums, part, states, plain, block, p);
     __syncwarp();
     long long first = (long long)(block.first_lane + block.lanes) * p.width;
-    first += block.first_unit + block.units;
+    first += block.first_unit;
     write_states(states, block, first, p);
     write_outputs(p.outputs, part, block, first, p);
     if (B::HAS_OUTPUT)
@@ -286,5 +294,5 @@ DEVICE void step(const StepParams& p) {
 }
 
 // Two blocks of a multiprocessor leave a thread 128 registers.
-INSTANCE(__launch_bounds__(256, 2) mingru_step, StepParams, step<2>)
-INSTANCE(__launch_bounds__(256, 2) lstm_step, StepParams, step<4>)
+INSTANCE(__launch_bounds__(THREADS, 2) mingru_step, StepParams, step<2>)
+INSTANCE(__launch_bounds__(THREADS, 2) lstm_step, StepParams, step<4>)
