@@ -1,8 +1,17 @@
 """Random number generators that objects own, move between devices, and save."""
 
+import contextlib
 import hashlib
+import math
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from itertools import chain, count
 
 import torch
+
+_MAX_NUMBERS = 2**22  # of a block, 16 MiB
+# calls that a block is for, whether a CUDA graph is being recorded, what is left of each block
+_AHEAD: ContextVar[tuple[int, bool, dict]] = ContextVar("ahead", default=(1, False, {}))
 
 
 def stream_seed(seed: int, name: str) -> int:
@@ -18,6 +27,35 @@ def seed_of(kind: str, number: int, seed: int) -> int:
     its own, below 2**31.
     """
     return seed if number == 0 else stream_seed(seed, f"{kind} {number}") % 2**31
+
+
+@contextlib.contextmanager
+def drawn_ahead(n_calls: int) -> Iterator[None]:
+    """Inside, `draw` draws the numbers of so many calls at once. More than 1 take a GPU."""
+    is_recording = n_calls > 1 and torch.cuda.is_current_stream_capturing()
+    token = _AHEAD.set((n_calls, is_recording, {}))
+    try:
+        yield
+    finally:
+        _AHEAD.reset(token)
+
+
+def draw(
+    owner: object, fill: Callable, shape: tuple, generator: torch.Generator | None, device
+) -> torch.Tensor:
+    """Returns new random numbers, float32, filled in by a method such as `torch.Tensor.normal_`.
+    Each owner, such as a policy's output, has blocks of its own, on whichever stream it runs.
+    """
+    n_calls, was_recording, blocks = _AHEAD.get()
+    # a graph that is recorded inside would read a block from outside again in every replay
+    if n_calls == 1 or torch.cuda.is_current_stream_capturing() != was_recording:
+        return fill(torch.empty(shape, device=device), generator=generator)
+    block = min(n_calls, 1 + _MAX_NUMBERS // (1 + math.prod(shape))), *shape
+    drawn = (fill(torch.empty(block, device=device), generator=generator) for _ in count())
+    # an owner on two streams has two blocks, as streams do not wait for each other
+    stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
+    key = owner, fill, block, generator, stream
+    return next(blocks.setdefault(key, chain.from_iterable(drawn)))
 
 
 class SeededGenerator:

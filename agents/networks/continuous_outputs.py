@@ -13,6 +13,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from megastep import spaces
+from megastep.agents.generator import draw
 from megastep.agents.networks.heads import Output
 from megastep.agents.networks.linear import linear
 
@@ -83,7 +84,7 @@ class GaussianOutput(_BoundedOutput):
     ) -> torch.Tensor:
         """Samples actions."""
         mean, log_std = logits.chunk(2, -1)
-        noise = torch.empty_like(mean).normal_(generator=generator)
+        noise = draw(self, torch.Tensor.normal_, mean.shape, generator, mean.device)
         return self._actions((mean + log_std.exp() * noise).tanh())
 
     def greedy(self, logits: torch.Tensor) -> torch.Tensor:

@@ -7,6 +7,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from megastep import spaces
+from megastep.agents.generator import draw
 from megastep.agents.networks.fused import LIBRARY, aligned, fused
 from megastep.agents.networks.heads import FORBIDDEN, Output
 from megastep.agents.networks.linear import (
@@ -154,10 +155,9 @@ class DuellingOutput(Output):
         """Returns weight and bias of the value, then of the advantages."""
         return *self.value.parameters(), *self.advantage.parameters()
 
-    @staticmethod
-    def noise(shape, generator, device) -> torch.Tensor:
+    def noise(self, shape, generator, device) -> torch.Tensor:
         """Returns (2, *shape) from 0 to 1: which random action, and whether to take it."""
-        return torch.rand(2, *shape, generator=generator, device=device)
+        return draw(self, torch.Tensor.uniform_, (2, *shape), generator, device)
 
     def sample(
         self,

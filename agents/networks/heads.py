@@ -19,6 +19,7 @@ import torch
 from torch import nn
 
 from megastep import spaces
+from megastep.agents.generator import draw
 from megastep.agents.networks.fused import DTYPES, LIBRARY, fused
 from megastep.agents.networks.intakes import ConcatIntake
 from megastep.agents.networks.linear import cast, compute_dtype, linear
@@ -127,11 +128,9 @@ def _act_on_gpu(
     weight, bias = (cast(leaf, dtype) for leaf in output.linear.parameters())
     features, (n_agents, n_choices) = x.to(dtype).contiguous(), output.shape
     n_lanes, width = features.shape
-    noise = None
+    logits, noise = features.new_empty(n_lanes, *output.shape, dtype=torch.float32), None
     if sample:
-        noise = torch.empty(n_lanes, *output.shape, device=x.device)
-        noise.exponential_(generator=generator)
-    logits = features.new_empty(n_lanes, *output.shape, dtype=torch.float32)
+        noise = draw(output, torch.Tensor.exponential_, logits.shape, generator, x.device)
     actions = torch.empty(n_lanes, n_agents, dtype=torch.int64, device=x.device)
     logprobs = torch.empty_like(logits[:, 0, 0])
     launch(
@@ -179,8 +178,8 @@ class MultiDiscreteOutput(Output):
         self, logits: torch.Tensor, generator: torch.Generator | None = None
     ) -> torch.Tensor:
         """Samples actions by the Gumbel-max trick."""
-        noise = torch.empty_like(logits).exponential_(generator=generator).clamp_(min=_TINY).log_()
-        return (logits - noise).argmax(-1)
+        noise = draw(self, torch.Tensor.exponential_, logits.shape, generator, logits.device)
+        return (logits - noise.clamp_(min=_TINY).log_()).argmax(-1)
 
     def greedy(self, logits: torch.Tensor) -> torch.Tensor:
         """Returns the most likely actions."""

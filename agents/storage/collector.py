@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 import torch
 
+from megastep.agents.generator import drawn_ahead
 from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import Actor
@@ -50,7 +51,9 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
     # they are stored before the step, elsewhere with what comes of it.
     is_ours = type(env).__module__.startswith("megastep.envs.") and optional(env, "capturable")
     features = torch.empty(0)
-    with policy.compute_dtype():
+    # on a CPU, a draw of several steps may give other numbers than one each
+    n_ahead = rollout.n_steps if rollout.reward.is_cuda else 1
+    with policy.compute_dtype(), drawn_ahead(n_ahead):
         seen = rollout.store_world(0, world)
         for t in range(rollout.n_steps):
             with torch.autocast(rollout.reward.device.type, enabled=False):
