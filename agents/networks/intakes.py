@@ -15,12 +15,12 @@ from megastep import spaces
 from megastep.agents.networks.fused import LIBRARY, fused
 from megastep.agents.networks.linear import ACTIVATIONS, compute_dtype, linear
 from megastep.agents.networks.running_norm import MAX_LEAVES, RunningNorm, are_readable, packed_leaf
+from megastep.devices import n_resident_threads
 from megastep.imports import resolve
-from megastep.kernels.build.launch import BLOCK, Blocks, launch
+from megastep.kernels.build.launch import launch
 from megastep.types import Space, Tree
 
-_MAX_STEPS = 65_535  # blocks along y
-_ROWS = LIBRARY.constants["NORMALISED_ROWS"]
+_ROWS, _BLOCKS = (LIBRARY.constants[f"NORMALISED_{name}"] for name in ("ROWS", "BLOCKS"))
 
 
 # ---- Encoders of a leaf ----
@@ -126,8 +126,12 @@ def _fits(intake, obs, lanes=None) -> bool:
     has_known = intake.is_fused and len(leaves) <= MAX_LEAVES and are_readable(leaves)
     is_bf16 = compute_dtype(intake.project.weight) == torch.bfloat16
     has_gradient = any(leaf.requires_grad for leaf in leaves)
-    is_long = lanes is not None and len(leaves[0]) > _MAX_STEPS
-    return has_known and is_bf16 and not has_gradient and not is_long
+    return has_known and is_bf16 and not has_gradient
+
+
+def _has_words(leaf) -> bool:
+    """Returns whether four numbers of a leaf (..., F) are always a word."""
+    return leaf.shape[-1] % 4 == 0 and leaf.data_ptr() % (4 * leaf.itemsize) == 0
 
 
 def _encode_on_gpu(intake, obs, lanes=None) -> torch.Tensor:
@@ -141,14 +145,18 @@ def _encode_on_gpu(intake, obs, lanes=None) -> torch.Tensor:
     n_selected = n_lanes if lanes is None else len(lanes)
     shape = n_steps, n_selected, intake.n_columns
     features = flat[0].new_empty(shape, dtype=torch.bfloat16)
-    plain = itertools.takewhile(lambda leaf: leaf.shape[-1] % 4 == 0, flat)
-    n_threads = intake.n_columns // 4 * -(-n_selected // _ROWS)
+    plain = itertools.takewhile(_has_words, flat)
+    n_plain, n_rows = sum(leaf.shape[-1] // 4 for leaf in plain), n_steps * n_selected
+    n_threads = intake.n_columns - 3 * n_plain  # of a row: one per word, and per other column
+    # no more than the GPU runs at once: a thread reads statistics and divides once for all its rows
+    room = n_resident_threads(features.device, _BLOCKS) // n_threads
+    stride = min(-(-n_rows // _ROWS), max(room, 1))
     launch(
-        *(LIBRARY, "normalise", features.device, Blocks(-(-n_threads // BLOCK), n_steps)),
+        *(LIBRARY, "normalise", features.device, stride * n_threads),
         leaves=b"".join(map(packed_leaf, norms, flat)),
-        **dict(lanes=lanes, features=features, n_steps=n_steps, n_lanes=n_lanes),
+        **dict(lanes=lanes, features=features, n_rows=n_rows, n_lanes=n_lanes),
         **dict(n_selected=n_selected, n_columns=intake.n_columns),
-        n_plain_words=sum(leaf.shape[-1] // 4 for leaf in plain),
+        **dict(n_plain_words=n_plain, stride=stride),
     )
     return intake.encode_columns(features if lanes is not None else features.view(*lead, -1))
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from megastep import cache
-from megastep.agents.networks import fused
+from megastep.agents.networks import fused, intakes
 from megastep.engine import operations, rendering
 from megastep.kernels.build import compile
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
@@ -165,7 +165,7 @@ class CudaOnCpu:
         """Replaces `launch` in all modules that import it."""
         self.launched.clear()
         monkeypatch.setattr(fused, "uses_gpu", lambda: True)
-        for module in operations, rendering:
+        for module in operations, rendering, intakes:
             monkeypatch.setattr(module, "n_resident_threads", lambda *_: RESIDENT_THREADS)
         for path, module in list(sys.modules.items()):
             if path.startswith("megastep.") and vars(module).get("launch") is launch:

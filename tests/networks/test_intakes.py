@@ -140,15 +140,18 @@ def assert_close(fused, plain):
     torch.testing.assert_close(fused.float().cpu(), plain.float().cpu(), rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("lanes", [None, [3, 0, 3, 4]])
+@pytest.mark.parametrize("offset", [0, 1])
+@pytest.mark.parametrize("lanes", [None, [3, 0, 3, 22, 7, 4, 1]])
 @pytest.mark.parametrize("kinds", [(48, 3, 12), (12, 5), (7,), (3, 64, 1)])
-def test_kernel_normalises_like_pytorch(to_gpu, kinds, lanes):
-    """Leaves of 1 to 64 features in float16 and float32, with statistics of one or more."""
+def test_kernel_normalises_like_pytorch(to_gpu, monkeypatch, kinds, lanes, offset):
+    """Leaves of 1 to 64 features in float16 and float32, with statistics of one or more, of which
+    words of four may be aligned. A thread handles all rows, several, or at most four.
+    """
     torch.manual_seed(0)
     space, obs = arrdict(), arrdict()
     for i, n in enumerate(kinds):
         space[f"{i}"] = spaces.MultiVector(1, n) if n % 3 else spaces.MultiImage(1, 3, 1, n // 3)
-        obs[f"{i}"] = torch.randn(3, 5, *space[f"{i}"].shape).to(
+        obs[f"{i}"] = torch.randn(3, 23, *space[f"{i}"].shape).to(
             torch.float32 if i % 2 else torch.float16
         )
     intake = heads.intake(space, 32)
@@ -160,13 +163,18 @@ def test_kernel_normalises_like_pytorch(to_gpu, kinds, lanes):
         expected = intake.encode(obs, of).bfloat16()
     for norm in intake.norms:
         norm.mean, norm.scale = to_gpu(norm.mean), to_gpu(norm.scale)
-    inputs = obs.map(to_gpu), None if of is None else to_gpu(of)
-    features = intakes._encode_on_gpu(intake, *inputs).cpu()
-    # a product with 1 / scale may differ in the last bit of float32, and so of bfloat16
-    torch.testing.assert_close(
-        features[..., : sum(kinds)], expected[..., : sum(kinds)], rtol=2**-7, atol=1e-6
-    )
-    assert features.shape[-1] % 8 == 0 and not features[..., sum(kinds) :].any()
+    longer = obs.map(lambda leaf: to_gpu(torch.cat([leaf.flatten()[:offset], leaf.flatten()])))
+    inputs = arrdict({key: longer[key][offset:].view_as(leaf) for key, leaf in obs.items()})
+    results = []  # all kept, so that none is in the memory of another
+    for n_threads in (0, 150, 10**6):
+        monkeypatch.setattr(intakes, "n_resident_threads", lambda *_, n=n_threads: n)
+        results.append(intakes._encode_on_gpu(intake, inputs, None if of is None else to_gpu(of)))
+    for features in (result.cpu() for result in results):
+        # a product with 1 / scale may differ in the last bit of float32, and so of bfloat16
+        torch.testing.assert_close(
+            features[..., : sum(kinds)], expected[..., : sum(kinds)], rtol=2**-7, atol=1e-6
+        )
+        assert features.shape[-1] % 8 == 0 and not features[..., sum(kinds) :].any()
 
 
 ROW, THREE = spaces.MultiImage(1, 3, 1, 16), spaces.MultiVector(1, 3)

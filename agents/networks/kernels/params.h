@@ -4,7 +4,8 @@
 #pragma once
 
 constexpr int MAX_LEAVES = 8;          // of an observation, that a launch handles
-constexpr int NORMALISED_ROWS = 4;     // rows that a thread normalises
+constexpr int NORMALISED_ROWS = 4;     // rows that a thread normalises at once
+constexpr int NORMALISED_BLOCKS = 16;  // of a multiprocessor, that do so at once
 constexpr int STRIP = 128;             // rows that a block adds up
 constexpr int STRIP_THREADS = 256;     // of such a block
 constexpr int HEADS_ROWS = 32;         // that a block of the heads' forward kernel handles
@@ -69,14 +70,14 @@ struct IntakeLeafParams {
 
 struct NormaliseParams {
     IntakeLeafParams leaves[MAX_LEAVES];
-    const long long* lanes;  // (M), the lanes to read; null: all, M = B
-    void* features;          // (T, M, n_columns) bfloat16
-    int n_steps;
-    int n_lanes;        // B
-    int n_selected;     // M
-    int n_columns;      // a multiple of 4; those after the leaves' features are 0
-    int n_plain_words;  // of four columns, before the first leaf whose features are no multiple of
-                        // 4
+    const long long* lanes;      // (M), the lanes to read; null: all, M = B
+    void* features;              // (T, M, n_columns) bfloat16
+    unsigned int n_rows;         // T M
+    unsigned int n_lanes;        // B
+    unsigned int n_selected;     // M
+    unsigned int n_columns;      // a multiple of 4; those after the leaves' features are 0
+    unsigned int n_plain_words;  // of four columns, before the first leaf without whole words
+    unsigned int stride;         // between two rows of a thread
 };
 
 struct MomentsParams {
