@@ -67,11 +67,14 @@ class Movable(Kind):
 
     def lock(self, mask: torch.Tensor, team: torch.Tensor | int) -> None:
         """Locks objects where ``mask``, (N,) or (N, K) bool, is True, for a team: an integer of
-        at least 0, or (N, K) of them. Nothing moves them, and nobody holds them. What is locked
-        keeps its owner.
+        at least 0, or (N, K) of them, of which negative ones lock nothing. Nothing moves them, and
+        nobody holds them. What is locked keeps its owner.
         """
         mask = self._broadcast(mask) & self.visible & ~self.locked
-        team = checks.integer("team", team, 0) if isinstance(team, int) else team
+        if isinstance(team, torch.Tensor):
+            mask = mask & (team >= 0)
+        else:
+            team = checks.integer("team", team, 0)
         self.owners.copy_(torch.where(mask, team, self.owners))
         self.locked.logical_or_(mask)
         self._stop(mask)

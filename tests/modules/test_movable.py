@@ -90,7 +90,12 @@ def test_nobody_moves_what_is_locked_and_its_team_alone_unlocks_it(device):
     box, everywhere = objects["box"], torch.ones(2, dtype=torch.bool, device=device)
     put(box, (2.35, 3.0))
     box.grab(box.touching(0.1))
-    box.lock(everywhere, team=1)
+    nobody = torch.full((2, 1), -1, device=device)
+    box.lock(everywhere, team=nobody)
+    assert not box.locked.any() and (box.holders == 0).all()
+    with pytest.raises(ValueError, match="team must be an integer of at least 0"):
+        box.lock(everywhere, team=-1)
+    box.lock(everywhere, team=nobody + 2)
     box.lock(everywhere, team=0)  # too late
     assert (box.owners == 1).all() and (box.holders == -1).all()
     box.grab(box.touching(0.1))
