@@ -3,6 +3,7 @@ conversions. N environments, B lanes.
 """
 
 import itertools
+import weakref
 from collections.abc import Callable, Sequence
 from typing import cast
 
@@ -90,9 +91,13 @@ def _unflattened(tree, rest) -> Tree:
     return {key: _unflattened(value, rest) for key, value in tree.items()}
 
 
+#: The last made of each environment, by the environment's id.
+_LATEST: "weakref.WeakValueDictionary[int, Lanes]" = weakref.WeakValueDictionary()
+
+
 class Lanes:
-    """Steps an environment. On a GPU steps are CUDA graphs, and worlds are valid until the next
-    step or reset.
+    """Steps an environment, until others are made of it. On a GPU steps are CUDA graphs, and worlds
+    are valid until the next step or reset.
 
     Args:
         same_step: begin a new episode in the step that ends one, by a masked reset.
@@ -124,6 +129,17 @@ class Lanes:
         self._row = torch.empty(2, dtype=torch.int64, device=self.device)
         if purpose:
             self._require_masks(purpose)
+        self._is_replaced = False
+        if older := _LATEST.get(id(env)):
+            older._is_replaced = True  # both would write into one last world
+        _LATEST[id(env)] = self
+
+    def _require_own(self) -> None:
+        if self._is_replaced:
+            raise ValueError(
+                f"this {type(self.env).__name__} was given to another adapter since, which steps "
+                "it now: make an environment for each adapter"
+            )
 
     def _require_masks(self, purpose) -> None:
         if not self._takes_masks:
@@ -139,6 +155,7 @@ class Lanes:
         new rows. Lane 0 has the seed, the next the next seed; or there is one per lane. An episode
         depends on the seed and the lane.
         """
+        self._require_own()
         if seed is not None or mask is not None:
             self._require_masks("a seed or a mask")
         elif not self._takes_masks:
@@ -197,6 +214,7 @@ class Lanes:
         the first observation where an episode ended, and the final world its last one; otherwise
         both are the same. On a GPU the same objects each time.
         """
+        self._require_own()
         if not isinstance(self._step, Graph):
             with torch.inference_mode(False), torch.no_grad():
                 decision = self._decision(actions)

@@ -2,6 +2,7 @@
 not fit. What needs a library that is not installed is skipped.
 """
 
+import copy
 import importlib.util
 import re
 import subprocess
@@ -136,6 +137,18 @@ def test_lanes_with_equal_seeds_differ_and_repeat():
     env = adapters.VectorEnv(pong(3))
     obs, again = (env.reset(seed=[5, 5, 7])[0] for _ in range(2))
     assert np.array_equal(obs, again) and not np.array_equal(obs[0], obs[1])
+
+
+def test_an_environment_has_one_adapter_the_last():
+    room = pong()
+    first, second = adapters.VectorEnv(room, to_numpy=False), adapters.VectorEnv(room)
+    for call in (first.reset, lambda: first.step(first.action_space.sample())):
+        with pytest.raises(ValueError, match="this Pong was given to another adapter since"):
+            call()
+    second.reset()
+    copied = copy.deepcopy(second)
+    adapters.VectorEnv(room)
+    copied.step(copied.action_space.sample())
 
 
 def test_what_does_not_fit_is_named_in_gymnasium():
