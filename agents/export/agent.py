@@ -1,8 +1,8 @@
 """Turns a run, or a policy, into an agent file with its acting weights, and a card beside it.
 
-Evaluate the run first, for the tables: `megastep evaluate run=RUN geometry=suite episodes=8000`,
-and with against=bot for duels. What follows "What it is for" in a card is written by hand, and kept
-when the agent is exported again.
+Evaluate the run first, for the tables: `megastep evaluate run=RUN`, with geometry=suite
+episodes=8000 if it plays in homes of all kinds, and against=bot for duels. What follows "What it is
+for" in a card is written by hand, and kept when the agent is exported again.
 """
 
 import json
@@ -114,8 +114,7 @@ def write(run: str, file: Path) -> None:
     folder = folders.folder_of(loaded.path)
     has_homes = components.takes_geometries(factory.config_of(loaded).env.name)
     if not (rows := tables_of(folder, loaded.step, has_homes)):
-        words = " geometry=suite episodes=8000" if has_homes else ""
-        command = f"{folders.command_of('evaluate', 'run', loaded.path)}{words}"
+        command = folders.command_of("evaluate", "run", loaded.path)
         console.warn(f"the card has no results, for {command} was not run")
     lines = json_lines.read(folder / provenance.FILE, typed_json.Start)
     lines = [line for line in lines if line["samples"] < loaded.step]

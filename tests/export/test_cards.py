@@ -32,7 +32,7 @@ def test_a_command_on_a_card_has_no_folder_of_the_machine():
     assert [*map(agent.command_of, commands)] == ["python train.py a=1", "python tune.py a=1"]
 
 
-def test_export_writes_a_card_whose_commands_work_for_a_colleague(here, monkeypatch):
+def test_export_writes_a_card_whose_commands_work_for_a_colleague(here, monkeypatch, capsys):
     (here / "heist.py").write_text(HEIST)
     monkeypatch.syspath_prepend(here)
     words = [*tiny.TINY[1:], *tiny.SHORT_EPISODES, "env=heist:Heist", "samples=64", "folder=run"]
@@ -53,6 +53,8 @@ def test_export_writes_a_card_whose_commands_work_for_a_colleague(here, monkeypa
     for left_out in (here / "run/provenance.jsonl", *here.glob("run/evaluations/*")):
         left_out.unlink()
     assert export.main(words) == 0
+    not_run = " run=run/checkpoints/step_64 was not run\n"
+    assert not_run in capsys.readouterr().err, "of any geometry, as not all are for any agent"
     again = path.read_text()
     assert "The best thief, " in again and "Not evaluated." in again and "- command" not in again
     path.write_text("Notes\n")
