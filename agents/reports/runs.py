@@ -100,6 +100,8 @@ def read(folder: Path) -> Run:
 
 def expanded(names: Sequence[str]) -> list[Path]:
     """Returns the run folders of names: runs, `latest`, sweeps with all jobs. UserError if not."""
+    if not names:
+        raise UserError("run=[] names no run; give their folders, or latest")
     paths = []
     for name in names:
         jobs = sorted(file.parent for file in Path(name).glob("*/metrics.jsonl"))

@@ -149,6 +149,8 @@ def find(name: str, member: int | str | None = "best") -> Path:
     """Returns the path of a run, a checkpoint or an agent file: an existing path, `latest`, or the
     name of a pretrained agent; of a population a member's, or its own with None. UserError.
     """
+    if not name:
+        raise UserError("a run has no name here; give its folder, or latest")
     path = Path(name)
     if name == "latest" and (folders := known()):
         path = folders[-1]

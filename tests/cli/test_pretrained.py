@@ -114,6 +114,7 @@ def test_commands_are_without_places_of_the_machine(words, command):
     [
         (["run", "Tiny"], "not a name for an agent"),
         (["run/snapshots/step_512", NAME], "has weights only"),
+        (["", NAME], "a run has no name here; give its folder, or latest"),
         (["nowhere", NAME], "nowhere is neither a run folder nor a pretrained agent"),
     ],
 )

@@ -193,6 +193,8 @@ def test_page_of_a_resumed_run_names_the_command_that_made_it(here, tmp_path):
         (report.main, ["file=x.html"], "run: is missing"),
         (report.main, ["run=a", "file=x.pdf"], "not a page; its name ends with .html"),
         (report.main, ["run=nowhere"], "is neither a run folder nor a pretrained agent"),
+        (report.main, ["run=[]"], "run=[] names no run"),
+        (compare.main, ["run=[]"], "run=[] names no run"),
         (report.main, ["run=a", "fiel=x.html"], "did you mean file?"),
         (report.main, ["run=a", "run=b"], "run: is given twice"),
         (report.main, ["run=a", "file=/proc/x/y.html"], "cannot be written"),
