@@ -58,6 +58,12 @@ def quantity(text: object, kind: str) -> object:
     return int(total) if total.is_integer() else total
 
 
+def _device(name: str) -> str:
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
+        raise ValueError(f"{name!r} is unknown; there are auto, cpu, cuda, cuda:1, ...")
+    return name
+
+
 def _every(given: int | float | str) -> int | str:
     """Returns a number of samples, or text such as `60s`."""
     seconds, samples = (cast("float | str", quantity(given, kind)) for kind in UNITS)
@@ -152,7 +158,7 @@ class Common:
     """Settings of every script."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)]
-    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+    device: Annotated[str, AfterValidator(_device)]
     trust: bool = False  # import what checkpoints that others made name
 
 

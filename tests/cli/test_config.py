@@ -169,6 +169,7 @@ def test_all_errors_are_listed_at_once():
         "env=explorr", "learner.lrr=1", "learner.lr=-1", "learner.gamma=nan", "seed=x", "device=gpu"
     )
     assert set(messages) == {"env", "learner.lrr", "learner.lr", "learner.gamma", "seed", "device"}
+    assert messages["device"] == "'gpu' is unknown; there are auto, cpu, cuda, cuda:1, ..."
 
 
 @pytest.fixture(scope="module")
