@@ -93,7 +93,9 @@ average_gradients = fused(_average_on_gpu, _takes_average, operation=pooling.ave
 
 @functools.cache
 def one(device: torch.device) -> torch.Tensor:
-    """Returns the gradient () of a loss itself: a loss that gets it has nothing to scale."""
+    """Returns the gradient () of a loss itself: a loss that gets it has nothing to scale. It is made
+    with the first learner, as the members of a population read it on streams of their own.
+    """
     return torch.ones((), device=device)
 
 
@@ -135,6 +137,7 @@ class GradientSteps:
         factors: dict = dict(lr_factors=lr_factors or {}, weight_decays=weight_decays or {})
         self.optimizer: Adam | Imported = make(parameters, self.lr, **factors)
         self.check = NonFiniteCheck(device)
+        one(self.lr.device)
         # of the update in progress; totals are those of metrics, then steps taken and skipped
         self.is_finite: torch.Tensor | None = None
         self.totals: torch.Tensor | None = None

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from megastep.agents.algorithms.gradient_steps import GradientSteps, average_gradients
+from megastep.agents.algorithms.gradient_steps import GradientSteps, average_gradients, one
 from megastep.agents.algorithms.optimizers import BETAS, EPS, Adam, has_kernels
 from megastep.agents.distributed import pooling
 
@@ -176,3 +176,23 @@ def test_skipped_step_changes_nothing():
     assert all(map(torch.equal, skipping, plain))
     assert first.n_steps == second.n_steps == 2
     assert all(map(torch.equal, first.squares, second.squares))
+
+
+@pytest.mark.cuda
+def test_learners_on_streams_of_their_own_wait_for_no_other():
+    """The first one's stream is busy, with what the others read if nobody made it before."""
+    streams = [torch.cuda.Stream() for _ in range(2)]
+    params = [torch.nn.Parameter(torch.ones(3, device="cuda")) for _ in streams]
+    with torch.cuda.stream(streams[0]):
+        torch.full((), 7.0, device="cuda")  # is freed, and in that place `one` would be
+    one.cache_clear()
+    learners = [GradientSteps([p], 0.1, 0.5, p.device) for p in params]
+    n_valid = torch.tensor(3, device="cuda")
+    torch.cuda.synchronize()
+    for i, stream in enumerate(streams):
+        with torch.cuda.stream(stream):
+            if i == 0:
+                torch.cuda._sleep(10**9)
+            learners[i].backward((2 * params[i]).sum(), {}, n_valid)
+    torch.cuda.synchronize()
+    assert all(p.grad.eq(2).all() for p in params)
