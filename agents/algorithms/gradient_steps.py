@@ -93,8 +93,8 @@ average_gradients = fused(_average_on_gpu, _takes_average, operation=pooling.ave
 
 @functools.cache
 def one(device: torch.device) -> torch.Tensor:
-    """Returns the gradient () of a loss itself: a loss that gets it has nothing to scale. It is made
-    with the first learner, as the members of a population read it on streams of their own.
+    """Returns the gradient () of a loss itself: a loss that gets it has nothing to scale. The first
+    learner makes it, as the members of a population read it on streams of their own.
     """
     return torch.ones((), device=device)
 

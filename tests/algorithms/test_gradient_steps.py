@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from megastep.agents.algorithms.gradient_steps import GradientSteps, average_gradients, one
+from megastep.agents.algorithms import gradient_steps
+from megastep.agents.algorithms.gradient_steps import GradientSteps, average_gradients
 from megastep.agents.algorithms.optimizers import BETAS, EPS, Adam, has_kernels
 from megastep.agents.distributed import pooling
 
@@ -184,8 +185,8 @@ def test_learners_on_streams_of_their_own_wait_for_no_other():
     streams = [torch.cuda.Stream() for _ in range(2)]
     params = [torch.nn.Parameter(torch.ones(3, device="cuda")) for _ in streams]
     with torch.cuda.stream(streams[0]):
-        torch.full((), 7.0, device="cuda")  # is freed, and in that place `one` would be
-    one.cache_clear()
+        torch.full((), 7.0, device="cuda")  # is freed, and in that place it would be
+    gradient_steps.one.cache_clear()
     learners = [GradientSteps([p], 0.1, 0.5, p.device) for p in params]
     n_valid = torch.tensor(3, device="cuda")
     torch.cuda.synchronize()
