@@ -13,8 +13,8 @@ import torch
 from megastep.kernels.build import launch
 
 _THREAD = threading.local()  # its `work` waits for a sequence to run beside
-#: The latest gradient's event and version, until a sequence asks for any.
-_latest: tuple[torch.cuda.Event | None, int] | None = None
+#: The latest gradient's event, until a sequence asks for any.
+_latest: torch.cuda.Event | None = None
 
 
 @functools.cache
@@ -75,10 +75,15 @@ def waiting() -> Callable[[], object] | None:
     return work
 
 
-def mark(gradient: torch.Tensor) -> torch.Tensor:
-    """Returns a gradient, and keeps with it that it is computed `now`; see `ready`."""
+def mark(gradient: torch.Tensor, *still_read: torch.Tensor) -> torch.Tensor:
+    """Returns a gradient, and keeps with it that it is computed `now`; see `ready`. And tensors
+    allocated on the second stream that the current one still reads: the next sequence allocates
+    there before they are freed, and does not wait for those reads.
+    """
     global _latest
-    _latest = gradient.ready = now(gradient.device), gradient._version  # pyright: ignore[reportAttributeAccessIssue]
+    _latest = event = now(gradient.device)
+    if event is not None:
+        gradient.ready = event, gradient._version, still_read  # pyright: ignore[reportAttributeAccessIssue]
     return gradient
 
 
@@ -91,7 +96,5 @@ def ready(gradient: torch.Tensor) -> torch.cuda.Event | None:
     """
     global _latest
     latest, _latest = _latest, None
-    if latest is None or getattr(gradient, "ready", None) is not latest:
-        return None
-    event, version = latest
-    return event if version == gradient._version else None
+    event, version, _ = getattr(gradient, "ready", (None, 0, ()))
+    return event if event is latest and version == gradient._version else None

@@ -196,17 +196,19 @@ class _Sequence(torch.autograd.Function):
         residual = d_sum if ctx.is_residual else None
         if residual is not None and not ctx.on_cpu:
             residual = residual.clone()
-        event = beside.ready(d_outputs) if d_cell is None else None
+        has_states = d_cell is not None or any(ctx.needs_input_grad[6:8])
+        event = None if has_states else beside.ready(d_outputs)
         with beside.second_stream(x.device, event) as join:
             d_gates, d_bias, d_output, d_cell, d_x = backward(
                 input_weight, weight, reset, saved, d_outputs, d_cell
             )
         join()
-        d_bias = d_bias.sum(0) if ctx.on_cpu else sum_rows(d_bias)
         if d_x is None:
             d_x = gradient_of_inputs(d_gates, input_weight, residual)
         elif residual is not None:
             d_x += residual
+        beside.mark(d_x, d_gates, d_bias)  # beside all below, a layer below has its sequence
+        d_bias = d_bias.sum(0) if ctx.on_cpu else sum_rows(d_bias)
         flat, by_kernel = d_gates.flatten(0, 1), (lambda d, rows: matmul(d.T, rows))
         of_weights = by_kernel if ctx.on_cpu else gradient_of_weights
         d_input, d_weight = (of_weights(flat, rows.flatten(0, 1)) for rows in (x, hiddens))

@@ -1,6 +1,7 @@
 """Work on a second stream beside an LSTM's sequence."""
 
 import contextlib
+import weakref
 from typing import cast
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from megastep import engine, spaces
 from megastep.agents.algorithms.ppo import PPO
-from megastep.agents.networks import beside
+from megastep.agents.networks import beside, lstm
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.rollout import Rollout
 from tests.helpers.made_up import MOVES, OBS, weights
@@ -58,9 +59,71 @@ def test_a_gradient_is_ready_for_one_reader_if_nothing_is_added_to_it(monkeypatc
 
 def test_only_the_latest_gradient_is_ready(monkeypatch):
     """For an earlier one, what was freed since may still be read."""
-    monkeypatch.setattr(beside, "now", lambda device: "an event")
-    first, second = (beside.mark(torch.ones(3)) for _ in range(2))
-    assert [beside.ready(gradient) for gradient in (second, first)] == ["an event", None]
+    events = iter("abcd")
+    monkeypatch.setattr(beside, "now", lambda device: next(events))
+    gradients = [beside.mark(torch.ones(3)) for _ in range(2)]
+    assert [beside.ready(gradient) for gradient in gradients[::-1]] == ["b", None]
+    gradients = [beside.mark(torch.ones(3)) for _ in range(2)]
+    assert [beside.ready(gradient) for gradient in gradients] == [None, None]
+
+
+def chained(layers, x, reset, states):
+    for layer, state in zip(layers, states, strict=True):
+        x, _ = layer(x, reset, state, is_residual=True)
+    return x
+
+
+@pytest.mark.parametrize("has_gradient", [False, True])
+def test_sequences_of_lower_layers_wait_for_gradients_alone(monkeypatch, has_gradient):
+    """The memory that the layer above reads meanwhile is not freed before they have theirs. With a
+    gradient of its first state, a layer waits for all.
+    """
+    events, waited, gates = [None], [], []
+    in_order = lstm._backward_on_cpu
+
+    @contextlib.contextmanager
+    def second_stream(device, after):
+        waited.append(after)
+        yield lambda: None
+
+    def backward(*inputs):
+        assert all(leaf() is not None for leaf in gates[-1:])
+        results = in_order(*inputs)
+        gates.append(weakref.ref(results[0]))
+        return results
+
+    monkeypatch.setattr(beside, "now", lambda device: events.append(object()) or events[-1])
+    monkeypatch.setattr(beside, "second_stream", second_stream)
+    monkeypatch.setattr(lstm, "_backward_on_cpu", backward)
+    layers = [lstm.LSTM(16) for _ in range(3)]
+    states = [layer.initial(5) for layer in layers]
+    states[0]["cell"].requires_grad_(has_gradient)
+    reset, x = torch.zeros(2, 5, dtype=torch.bool), torch.randn(2, 5, 16, requires_grad=True)
+    chained(layers, x, reset, states).sum().backward()
+    assert waited == [*events[:2], None if has_gradient else events[2]] and len(events) == 4
+    assert not any(leaf() for leaf in gates)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("width", [128, 256])
+def test_gradients_of_layers_are_the_same_on_one_stream(width):
+    torch.manual_seed(1)
+    layers = [lstm.LSTM(width).cuda() for _ in range(4)]
+    states = [layer.initial(4096, "cuda") for layer in layers]
+    x, d = torch.randn(2, 16, 4096, width, device="cuda").bfloat16()
+    reset = torch.rand(16, 4096, device="cuda") < 0.1
+    leaves = [x.requires_grad_(), *(leaf for layer in layers for leaf in layer.parameters())]
+
+    def gradients():
+        with torch.autocast("cuda", torch.bfloat16):
+            y = chained(layers, x, reset, states)
+        torch.cuda._sleep(10**7)  # so that all is launched before any of it runs
+        return torch.autograd.grad(y, leaves, d)
+
+    with engine.without_early_starts():
+        expected = gradients()
+    for _ in range(5):
+        assert all(map(torch.equal, gradients(), expected))
 
 
 class Stream:
@@ -91,7 +154,7 @@ def test_each_stream_has_its_own_second_one(monkeypatch):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("layers, width", [(1, 256), (2, 256), (1, 128)])
+@pytest.mark.parametrize("layers, width", [(1, 256), (3, 256), (3, 128)])
 def test_an_update_is_the_same_on_one_stream(layers, width):
     """Where streams share a GPU there is no second one."""
     privileged, n_lanes, ends = spaces.MultiVector(1, 12), 4096, []
