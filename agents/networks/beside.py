@@ -1,20 +1,17 @@
-"""Work beside an LSTM's sequence, whose kernel waits for itself most of the time and leaves a fifth
-of a GPU idle. The sequence runs on a second stream; what it does not need, on the usual one.
+"""A second stream for an LSTM's sequence, whose kernel waits for itself most of the time and leaves
+a fifth of a GPU idle. What does not depend on the sequence overlaps with it on the usual stream.
 """
 
 import contextlib
 import functools
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import torch
 
 from megastep.kernels.build import launch
 
-_THREAD = threading.local()  # its `work` waits for a sequence to run beside
-#: The latest gradient's event, until a sequence asks for any.
-_latest: torch.cuda.Event | None = None
+_THREAD = threading.local()  # its `work` is to overlap with the next sequence
 
 
 @functools.cache
@@ -25,46 +22,35 @@ def _second_of(stream) -> torch.cuda.Stream:
     return torch.cuda.Stream(stream.device, priority=-1)
 
 
-def now(device: torch.device) -> torch.cuda.Event | None:
+def now(device: torch.device) -> torch.Event | None:
     """Returns the end of what is launched so far; None if a second stream would not help."""
-    if device.type != "cuda" or launch.is_shared():
-        return None
-    event = torch.cuda.Event()
-    event.record(torch.cuda.current_stream(device))
-    return event
+    is_alone = device.type == "cuda" and not launch.is_shared()
+    return torch.cuda.current_stream(device).record_event() if is_alone else None
 
 
 @contextlib.contextmanager
-def second_stream(
-    device: torch.device, after: torch.cuda.Event | None
-) -> Iterator[Callable[[], object]]:
-    """Launches on a second stream inside, after an event alone. Gives a function that makes the
-    current stream wait for it. Without an event there is only the current stream.
-
-    Memory allocated inside is the second stream's. What the current one allocates after the event
-    must not be used inside: freed memory may still be read there.
+def second_stream(after: torch.Event | None) -> Iterator[torch.cuda.Stream | None]:
+    """Gives a stream that waits for an event alone, and for which the current one waits in the end;
+    None without an event. What runs there must not use memory that the current one allocates after
+    the event, and allocates none itself unless that is `now`: what is freed may still be read.
     """
     if after is None:
-        yield lambda: None
+        yield None
         return
-    current = torch.cuda.current_stream(device)
-    stream = _second_of(current)
-    stream.wait_event(after)
-    with torch.cuda.stream(stream):
-        yield lambda: current.wait_stream(stream)
+    current = torch.cuda.current_stream(after.device)
+    _second_of(current).wait_event(after)
+    yield _second_of(current)
+    current.wait_stream(_second_of(current))
 
 
 @contextlib.contextmanager
-def meanwhile(work: Callable[[], object]) -> Iterator[list[Any]]:
-    """Runs `work` beside the first sequence of an LSTM inside, or at the end. Gives a list, to
-    which its result is added. It has no gradient, and reads nothing that is computed inside.
+def meanwhile(work: Callable[[], object]) -> Iterator[None]:
+    """Has the first sequence of an LSTM inside, if there is one, call `work`. This has no gradient,
+    and reads nothing that is computed inside.
     """
-    results: list[Any] = []
-    _THREAD.work = lambda: results.append(work())
+    _THREAD.work = work
     try:
-        yield results
-        if (left := waiting()) is not None:
-            left()
+        yield
     finally:
         _THREAD.work = None
 
@@ -75,26 +61,13 @@ def waiting() -> Callable[[], object] | None:
     return work
 
 
-def mark(gradient: torch.Tensor, *still_read: torch.Tensor) -> torch.Tensor:
-    """Returns a gradient, and keeps with it that it is computed `now`; see `ready`. And tensors
-    allocated on the second stream that the current one still reads: the next sequence allocates
-    there before they are freed, and does not wait for those reads.
-    """
-    global _latest
-    _latest = event = now(gradient.device)
-    if event is not None:
-        gradient.ready = event, gradient._version, still_read  # pyright: ignore[reportAttributeAccessIssue]
+def mark(gradient: torch.Tensor) -> torch.Tensor:
+    """Returns a gradient, and keeps with it that it is computed now, see `ready`."""
+    gradient.ready = now(gradient.device), gradient._version  # pyright: ignore[reportAttributeAccessIssue]
     return gradient
 
 
-def ready(gradient: torch.Tensor) -> torch.cuda.Event | None:
-    """Returns when the gradient that was marked last was computed, to the first who asks for any.
-    None: it is another, or something was added to it since.
-
-    Who gets None waits for the current stream, which may still read what was computed on the second
-    stream after the mark, and has been freed there.
-    """
-    global _latest
-    latest, _latest = _latest, None
-    event, version, _ = getattr(gradient, "ready", (None, 0, ()))
-    return event if event is latest and version == gradient._version else None
+def ready(gradient: torch.Tensor) -> torch.Event | None:
+    """Returns when a gradient was marked; None if never, or something was added to it since."""
+    event, version = getattr(gradient, "ready", (None, None))
+    return event if version == gradient._version else None

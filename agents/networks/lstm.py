@@ -88,30 +88,31 @@ def _forward_on_clusters(
     outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
     last_output, last_cell, saved = torch.empty_like(output), torch.empty_like(cell), [None, None]
     if saves:
-        lead = n_steps, -(-n_lanes // _LANES), width // _BLOCK_UNITS, _LANES // 8, _THREADS
+        n_clusters = -(-n_lanes // _LANES)
+        lead = n_steps, n_clusters, width // _BLOCK_UNITS, _LANES // 8, _THREADS
         saved = [gates.new_empty(*lead, 8), cell.new_empty(*lead, 2)]
     work = beside.waiting()
-    event = None if work is None else beside.now(x.device)
-    with beside.second_stream(x.device, event) as join:
-        _launch_clusters(
-            *("forward", width, x.device, n_lanes),
-            **dict(gates=gates, weight=weight, reset=reset, residual=residual),
-            **dict(last_output=output, last_cell=cell, output=last_output, cell=last_cell),
-            **dict(outputs=outputs, hiddens=hiddens, saved_gates=saved[0], saved_cells=saved[1]),
-            n_steps=n_steps,
-        )
-    if work is not None:
-        work()
-    saved.append(weight.T.contiguous() if saves else None)
-    join()
+    with beside.second_stream(None if work is None else beside.now(x.device)) as stream:
+        with torch.cuda.stream(stream):
+            _launch_clusters(
+                *("forward", width, x.device, n_lanes),
+                **dict(gates=gates, weight=weight, reset=reset, residual=residual),
+                **dict(last_output=output, last_cell=cell, output=last_output, cell=last_cell),
+                **dict(outputs=outputs, hiddens=hiddens),
+                **dict(saved_gates=saved[0], saved_cells=saved[1], n_steps=n_steps),
+            )
+        if work is not None:
+            work()
+        if saves:  # also memory for gradients: what is freed later may still be read by a stream
+            d_states = (torch.empty_like(cell) for _ in range(2))
+            d_bias = cell.new_empty(n_clusters, 4 * width)
+            saved = [*saved, weight.T.contiguous(), gates, d_bias, *d_states]
     return outputs, hiddens, last_output, last_cell, saved
 
 
 def _backward_on_clusters(input_weight, weight, reset, saved, d_outputs, d_cell) -> tuple:
     n_steps, n_lanes, width = d_outputs.shape
-    d_gates = d_outputs.new_empty(n_steps, n_lanes, 4 * width)
-    d_bias = saved[1].new_empty(-(-n_lanes // _LANES), 4 * width)
-    d_last_output, d_last_cell = (saved[1].new_empty(n_lanes, width) for _ in range(2))
+    d_gates, d_bias, d_last_output, d_last_cell = saved[3:]
     _launch_clusters(
         *("backward", width, weight.device, n_lanes),
         **dict(weight=saved[2], reset=reset),
@@ -169,7 +170,7 @@ class _Sequence(torch.autograd.Function):
         ctx, has_grad, x, input_weight, bias, weight, reset, output, cell, is_residual
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         ctx.set_materialize_grads(False)
-        ctx.on_cpu, ctx.is_residual = x.dtype == torch.float32, is_residual
+        ctx.on_cpu, ctx.is_residual, ctx.is_first = x.dtype == torch.float32, is_residual, True
         x, reset, output, cell = aligned(x), reset.contiguous(), aligned(output), aligned(cell)
         input_weight, bias, weight = (
             cast(w, x.dtype).contiguous() for w in (input_weight, bias, weight)
@@ -196,24 +197,24 @@ class _Sequence(torch.autograd.Function):
         residual = d_sum if ctx.is_residual else None
         if residual is not None and not ctx.on_cpu:
             residual = residual.clone()
-        has_states = d_cell is not None or any(ctx.needs_input_grad[6:8])
-        event = None if has_states else beside.ready(d_outputs)
-        with beside.second_stream(x.device, event) as join:
+        event = beside.ready(d_outputs) if d_cell is None and ctx.is_first else None
+        ctx.is_first = False  # of a retained graph, the memory for gradients may still be read
+        with beside.second_stream(event) as stream, torch.cuda.stream(stream):
             d_gates, d_bias, d_output, d_cell, d_x = backward(
                 input_weight, weight, reset, saved, d_outputs, d_cell
             )
-        join()
         if d_x is None:
             d_x = gradient_of_inputs(d_gates, input_weight, residual)
         elif residual is not None:
             d_x += residual
-        beside.mark(d_x, d_gates, d_bias)  # beside all below, a layer below has its sequence
+        beside.mark(d_x)  # first what the sequence of the layer below waits for
         d_bias = d_bias.sum(0) if ctx.on_cpu else sum_rows(d_bias)
         flat, by_kernel = d_gates.flatten(0, 1), (lambda d, rows: matmul(d.T, rows))
         of_weights = by_kernel if ctx.on_cpu else gradient_of_weights
         d_input, d_weight = (of_weights(flat, rows.flatten(0, 1)) for rows in (x, hiddens))
-        d_states = None, d_output, d_cell, None
-        return None, d_x, d_input, d_bias.float(), d_weight, *d_states
+        d_states = zip((d_output, d_cell), ctx.needs_input_grad[6:])
+        d_output, d_cell = (d.clone() if is_needed else None for d, is_needed in d_states)
+        return None, d_x, d_input, d_bias.float(), d_weight, None, d_output, d_cell, None
 
 
 @fused(lambda *inputs: _Sequence.apply(torch.is_grad_enabled(), *inputs), _fits, on_cpu=True)

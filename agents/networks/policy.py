@@ -261,10 +261,11 @@ class Policy(nn.Module):
         heads_of = self.output, self.critic, prediction
 
         encode = functools.partial(self.critic.encode, privileged, lanes)
+        start = functools.cache(functools.partial(start_heads, *heads_of, encode, mask))
         with self.compute_dtype():
-            with meanwhile(functools.partial(start_heads, *heads_of, encode, mask)) as results:
+            with meanwhile(start):
                 features, _ = self._features(obs, reset, state, lanes)
-            ((encoded, started),) = results
+            encoded, started = start()
             terms = head_terms(*heads_of, features, encoded, actions, mask, started)
         names = "logprobs", "entropies", "errors", "values", "features"
         return arrdict(zip(names, (*terms, features), strict=True))

@@ -1,11 +1,11 @@
 """Work on a second stream beside an LSTM's sequence."""
 
 import contextlib
-import weakref
 from typing import cast
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from megastep import engine, spaces
 from megastep.agents.algorithms.ppo import PPO
@@ -15,14 +15,14 @@ from megastep.agents.storage.rollout import Rollout
 from tests.helpers.made_up import MOVES, OBS, weights
 
 
-@pytest.mark.parametrize("has_sequence", [True, False])
-def test_work_is_done_once_by_a_sequence_or_at_the_end(has_sequence):
+def test_work_is_done_by_the_first_sequence():
     done = []
-    with beside.meanwhile(lambda: done.append("work") or "result") as results:
-        if has_sequence:
-            beside.waiting()()
-        assert results == ["result"] * has_sequence
-    assert (results, done, beside.waiting()) == (["result"], ["work"], None)
+    with beside.meanwhile(lambda: done.append("work")):
+        beside.waiting()()
+        assert beside.waiting() is None
+    with beside.meanwhile(lambda: done.append("other work")):
+        pass
+    assert done == ["work"] and beside.waiting() is None
 
 
 class Marked(torch.autograd.Function):
@@ -43,28 +43,18 @@ class Reader(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, d):
-        ctx.found += beside.ready(d), beside.ready(d)
+        ctx.found.append(beside.ready(d))
         return d, None
 
 
 @pytest.mark.parametrize("other", ["none", "before", "after"])
-def test_a_gradient_is_ready_for_one_reader_if_nothing_is_added_to_it(monkeypatch, other):
+def test_a_gradient_is_ready_if_nothing_is_added_to_it(monkeypatch, other):
     monkeypatch.setattr(beside, "now", lambda device: "an event")
     found = []
     y = Reader.apply(torch.ones(3, requires_grad=True), found)
     terms = [Marked.apply(y), *[y.square()] * (other != "none")]
     sum(term.sum() for term in (terms if other == "after" else terms[::-1])).backward()
-    assert found == ["an event" if other == "none" else None, None]
-
-
-def test_only_the_latest_gradient_is_ready(monkeypatch):
-    """For an earlier one, what was freed since may still be read."""
-    events = iter("abcd")
-    monkeypatch.setattr(beside, "now", lambda device: next(events))
-    gradients = [beside.mark(torch.ones(3)) for _ in range(2)]
-    assert [beside.ready(gradient) for gradient in gradients[::-1]] == ["b", None]
-    gradients = [beside.mark(torch.ones(3)) for _ in range(2)]
-    assert [beside.ready(gradient) for gradient in gradients] == [None, None]
+    assert found == ["an event" if other == "none" else None]
 
 
 def chained(layers, x, reset, states):
@@ -73,35 +63,41 @@ def chained(layers, x, reset, states):
     return x
 
 
-@pytest.mark.parametrize("has_gradient", [False, True])
-def test_sequences_of_lower_layers_wait_for_gradients_alone(monkeypatch, has_gradient):
-    """The memory that the layer above reads meanwhile is not freed before they have theirs. With a
-    gradient of its first state, a layer waits for all.
-    """
-    events, waited, gates = [None], [], []
-    in_order = lstm._backward_on_cpu
+def test_sequences_of_lower_layers_wait_for_gradients_alone(monkeypatch):
+    events, waited = [None], []
 
     @contextlib.contextmanager
-    def second_stream(device, after):
+    def second_stream(after):
         waited.append(after)
-        yield lambda: None
-
-    def backward(*inputs):
-        assert all(leaf() is not None for leaf in gates[-1:])
-        results = in_order(*inputs)
-        gates.append(weakref.ref(results[0]))
-        return results
+        yield None
 
     monkeypatch.setattr(beside, "now", lambda device: events.append(object()) or events[-1])
     monkeypatch.setattr(beside, "second_stream", second_stream)
-    monkeypatch.setattr(lstm, "_backward_on_cpu", backward)
     layers = [lstm.LSTM(16) for _ in range(3)]
-    states = [layer.initial(5) for layer in layers]
-    states[0]["cell"].requires_grad_(has_gradient)
     reset, x = torch.zeros(2, 5, dtype=torch.bool), torch.randn(2, 5, 16, requires_grad=True)
-    chained(layers, x, reset, states).sum().backward()
-    assert waited == [*events[:2], None if has_gradient else events[2]] and len(events) == 4
-    assert not any(leaf() for leaf in gates)
+    y = chained(layers, x, reset, [layer.initial(5) for layer in layers]).sum()
+    y.backward(retain_graph=True)
+    assert waited == events[:3] and len(events) == 4
+    y.backward()  # the first one may still read the memory for gradients
+    assert waited[3:] == [None] * 3
+
+
+class Nothing(TorchDispatchMode):
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        raise AssertionError(f"{function} may allocate memory that is still read")
+
+
+def test_a_sequence_allocates_nothing_on_its_stream(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: Nothing())
+    monkeypatch.setattr(lstm, "launch", lambda *_, **__: None)
+    monkeypatch.setattr(lstm, "sum_rows", lambda rows: rows.sum(0))
+    x = torch.zeros(2, 50, 128, dtype=torch.bfloat16)
+    weights = (torch.zeros(512, 128), torch.zeros(512), torch.zeros(512, 128))
+    leaves = [leaf.requires_grad_() for leaf in (*weights, *torch.zeros(2, 50, 128).unbind())]
+    reset = torch.zeros(2, 50, dtype=torch.bool)
+    y, *_ = lstm._Sequence.apply(True, x, *leaves[:3], reset, *leaves[3:], True)
+    gradients = [torch.autograd.grad(y.sum(), leaves, retain_graph=True) for _ in range(2)]
+    assert len({x.data_ptr() for x in (*gradients[0], *gradients[1])}) == 10
 
 
 @pytest.mark.cuda
@@ -142,12 +138,11 @@ def test_each_stream_has_its_own_second_one(monkeypatch):
     """Memory freed on it would go to another stream, which does not wait for the first."""
     monkeypatch.setattr(torch.cuda, "Stream", Stream)
     monkeypatch.setattr(torch.cuda, "stream", contextlib.nullcontext)
-    streams, event = [Stream(), Stream()], cast(torch.cuda.Event, "an event")
+    streams, event = [Stream(), Stream()], cast(torch.cuda.Event, Stream())
     for current in (*streams, *streams):
         monkeypatch.setattr(torch.cuda, "current_stream", lambda device, stream=current: stream)
-        with beside.second_stream(torch.device("cuda"), event) as join:
+        with beside.second_stream(event) as second, torch.cuda.stream(second):
             pass
-        join()
     seconds = [stream.waited_for for stream in streams]
     assert [len(set(each)) for each in seconds] == [1, 1] and seconds[0][0] is not seconds[1][0]
     assert all(each[0].waited_for == [event] * 2 for each in seconds)
