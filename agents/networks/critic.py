@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks import beside
+from megastep.agents.networks import side_stream
 from megastep.agents.networks.fused import LIBRARY, aligned, fused
 from megastep.agents.networks.heads import MultiDiscreteOutput, Output
 from megastep.agents.networks.intakes import ConcatIntake
@@ -255,7 +255,7 @@ class _JointHeads(torch.autograd.Function):
             **dict(d_product=d, sums=sums, **sizes._asdict()),
         )
         # first what the core's sequence waits for
-        d_features = beside.mark(gradient_of_inputs(d, weight).unflatten(0, lead))
+        d_features = side_stream.mark_ready(gradient_of_inputs(d, weight).unflatten(0, lead))
         d_biases, d_value_weight, d_value_bias = sum_rows(sums).split(sum_sizes)
         d_weight, first_hidden = gradient_of_weights(d, features), sizes.first_hidden
         n_scores = sizes.n_agents * sizes.n_choices

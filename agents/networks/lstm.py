@@ -17,7 +17,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from megastep.agents.networks import beside, step
+from megastep.agents.networks import side_stream, step
 from megastep.agents.networks.fused import (
     LIBRARY,
     aligned,
@@ -91,8 +91,8 @@ def _forward_on_clusters(
         n_clusters = -(-n_lanes // _LANES)
         lead = n_steps, n_clusters, width // _BLOCK_UNITS, _LANES // 8, _THREADS
         saved = [gates.new_empty(*lead, 8), cell.new_empty(*lead, 2)]
-    work = beside.waiting()
-    with beside.second_stream(None if work is None else beside.now(x.device)) as stream:
+    work = side_stream.take_work()
+    with side_stream.fork(None if work is None else side_stream.fork_point(x.device)) as stream:
         with torch.cuda.stream(stream):
             _launch_clusters(
                 *("forward", width, x.device, n_lanes),
@@ -197,9 +197,9 @@ class _Sequence(torch.autograd.Function):
         residual = d_sum if ctx.is_residual else None
         if residual is not None and not ctx.on_cpu:
             residual = residual.clone()
-        event = beside.ready(d_outputs) if d_cell is None and ctx.is_first else None
+        event = side_stream.ready_event(d_outputs) if d_cell is None and ctx.is_first else None
         ctx.is_first = False  # of a retained graph, the memory for gradients may still be read
-        with beside.second_stream(event) as stream, torch.cuda.stream(stream):
+        with side_stream.fork(event) as stream, torch.cuda.stream(stream):
             d_gates, d_bias, d_output, d_cell, d_x = backward(
                 input_weight, weight, reset, saved, d_outputs, d_cell
             )
@@ -207,7 +207,7 @@ class _Sequence(torch.autograd.Function):
             d_x = gradient_of_inputs(d_gates, input_weight, residual)
         elif residual is not None:
             d_x += residual
-        beside.mark(d_x)  # first what the sequence of the layer below waits for
+        side_stream.mark_ready(d_x)  # first what the sequence of the layer below waits for
         d_bias = d_bias.sum(0) if ctx.on_cpu else sum_rows(d_bias)
         flat, by_kernel = d_gates.flatten(0, 1), (lambda d, rows: matmul(d.T, rows))
         of_weights = by_kernel if ctx.on_cpu else gradient_of_weights

@@ -14,8 +14,8 @@ from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, heads, intakes, running_norm
-from megastep.agents.networks.beside import meanwhile
 from megastep.agents.networks.linear import ComputeDtype
+from megastep.agents.networks.side_stream import overlap
 from megastep.arrdict import arrdict
 from megastep.devices import set_threads, threads
 from megastep.dotdict import leaves, mapping
@@ -263,7 +263,7 @@ class Policy(nn.Module):
         encode = functools.partial(self.critic.encode, privileged, lanes)
         start = functools.cache(functools.partial(start_heads, *heads_of, encode, mask))
         with self.compute_dtype():
-            with meanwhile(start):
+            with overlap(start):
                 features, _ = self._features(obs, reset, state, lanes)
             encoded, started = start()
             terms = head_terms(*heads_of, features, encoded, actions, mask, started)
