@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
+from megastep.agents.networks import side_stream
 from megastep.agents.networks.fused import fused
 from megastep.agents.networks.heads import Output
 from megastep.agents.networks.policy import Policy
@@ -242,9 +243,6 @@ class R2D2(learner.GradientLearner):
         ]
         self.reward_scale = torch.zeros((), device=self.device)  # 0: there was no reward yet
         self.n_taken = torch.zeros((), dtype=torch.int64, device=self.device)  # gradient steps
-        # Both networks' LSTMs leave a fifth of a GPU idle, where the other's products can run.
-        on_gpu = self.device.type == "cuda"
-        self._beside = torch.cuda.Stream(self.device) if on_gpu else None
 
     def collector(self, env: Env, values: bool = False) -> Collector:
         """Returns an epsilon-greedy collector of rollouts of `n_steps` steps, and allocates the
@@ -308,14 +306,12 @@ class R2D2(learner.GradientLearner):
     def _losses(self, batch) -> Result:
         burn_in = self.replay_settings.burn_in
         sequence = batch.obs, batch.starts, batch.state
-        if self._beside is not None:
-            self._beside.wait_stream(torch.cuda.current_stream(self.device))
-        with torch.no_grad(), torch.cuda.stream(self._beside):
-            target_q = self.target.unroll(*sequence, burn_in=burn_in).logits
-        now = self.policy.unroll(*sequence, burn_in=burn_in, mask=batch.get("mask"))
+        # each network's LSTM leaves multiprocessors idle, where the other's products can run
+        with side_stream.fork(side_stream.fork_point(self.device)) as stream:
+            with torch.no_grad(), torch.cuda.stream(stream):
+                target_q = self.target.unroll(*sequence, burn_in=burn_in).logits
+            now = self.policy.unroll(*sequence, burn_in=burn_in, mask=batch.get("mask"))
         q = now.logits
-        if self._beside is not None:
-            torch.cuda.current_stream(self.device).wait_stream(self._beside)
         rest = mapping(lambda leaf: leaf[burn_in:])
         learned = rest(arrdict({name: batch[name] for name in _STEPS}))
         scale = self.reward_scale.masked_fill(self.reward_scale == 0, 1.0)
