@@ -175,7 +175,7 @@ class GradientLearner:
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""
         per_row = bytes_per_step(env, self.policy)
-        # some 24 float32 per unit, and 8 for each layer above the first
+        # 96 bytes per unit, and 32 for each layer above the first; an LSTM needs 45 and 26
         activations = self.n_networks * 4 * (16 + 8 * self.policy.layers) * self.policy.width
         # values are of the features of a whole rollout, 4 bytes per unit
         rollout = (self.n_steps + 1) * (per_row + 4 * self.policy.width)
