@@ -30,6 +30,21 @@ def seed_of(kind: str, number: int, seed: int) -> int:
 
 
 @contextlib.contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Inside, PyTorch's generator on the CPU has this seed, and one thread computes: orthogonal
+    weights of a seed differ with the number of threads, and so from host to host.
+    """
+    n_threads = torch.get_num_threads()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(n_threads)
+
+
+@contextlib.contextmanager
 def drawn_ahead(n_calls: int) -> Iterator[None]:
     """Inside, `draw` draws the numbers of so many calls at once. More than 1 take a GPU."""
     is_recording = n_calls > 1 and torch.cuda.is_current_stream_capturing()

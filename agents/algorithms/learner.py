@@ -39,7 +39,7 @@ from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.gradient_steps import GradientSteps
 from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.agents.errors import UserError, shortened
-from megastep.agents.generator import SeededGenerator, stream_seed
+from megastep.agents.generator import SeededGenerator, seeded, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
@@ -234,8 +234,7 @@ class GradientLearner:
         return self.coefficients["auxiliary_coef"] * error, {"auxiliary": error}
 
     def _make_extra(self) -> list[torch.nn.Parameter]:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(stream_seed(self.policy.seed, "extra"))
+        with seeded(stream_seed(self.policy.seed, "extra")):
             parameters = [*self.extra_parameters()]
         for parameter in parameters:
             if not isinstance(parameter, torch.nn.Parameter):

@@ -12,7 +12,7 @@ import torch
 from pydantic import AfterValidator, Field, SkipValidation
 from torch import nn
 
-from megastep.agents.generator import SeededGenerator, stream_seed
+from megastep.agents.generator import SeededGenerator, seeded, stream_seed
 from megastep.agents.networks import cores, heads, intakes, running_norm
 from megastep.agents.networks.linear import ComputeDtype
 from megastep.agents.networks.side_stream import overlap
@@ -110,8 +110,7 @@ class Policy(nn.Module):
         self.width, self.layers, self.bf16, self.output_kind = width, layers, bf16, output
         self.privileged_space = privileged_space if critic == "asymmetric" else None
         self.generator = SeededGenerator(stream_seed(seed, "policy"))
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        with seeded(seed):
             self.intake = heads.intake(obs_space, width, encoder, activation)
             self.core = cores.make_core(core, width, layers, activation)
             self.output = heads.output(action_space, width, output, continuous)

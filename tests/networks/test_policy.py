@@ -13,6 +13,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, stack
 from megastep.dotdict import leaves, mapping
 from tests.helpers.synchronisation import no_synchronisation
+from tests.helpers.weights import same
 
 T, B = 7, 5
 OBS = arrdict(rgb=spaces.MultiImage(1, 3, 1, 16), imu=spaces.MultiVector(1, 3))
@@ -93,6 +94,18 @@ def test_seed_determines_weights_and_actions():
     assert torch.equal(first.logits.movement, second.logits.movement)
     assert not torch.equal(first.logits.movement, other.logits.movement)
     assert not torch.equal(first.actions.movement, other.actions.movement)
+
+
+def test_weights_of_a_seed_are_the_same_with_any_number_of_threads():
+    policies, n_threads = [], torch.get_num_threads()
+    try:
+        for n in (1, 2, 4):
+            torch.set_num_threads(n)
+            policies.append(Policy(OBS, MOVES, PRIVILEGED, width=256).state_dict())
+            assert torch.get_num_threads() == n
+    finally:
+        torch.set_num_threads(n_threads)
+    assert all(same(policies[0], policy) for policy in policies)
 
 
 def test_weights_load_with_weights_only():
