@@ -18,7 +18,6 @@ COMMANDS = (
     "megastep train experiment=quickstart samples=1e6 folder=runs/tried",
     "megastep evaluate run=runs/tried episodes=64",
     "megastep record run=runs/tried file=runs/film.gif",
-    "megastep reproduce pong-cpu-1.5m",
 )
 
 
