@@ -166,6 +166,9 @@ def find(name: str, member: int | str | None = "best") -> Path:
         problem = "is not a run: it has no folder checkpoints"
         if name in agents:
             raise UserError(f"{name} {problem}; rename it to use the pretrained agent {name}")
+        if (path / "config.yaml").exists():
+            text = "has no checkpoint yet; wait for its first, or start its run again"
+            raise UserError(f"{name} {text}")
     elif name in agents:
         return agents[name]
     near = difflib.get_close_matches(name, map(str, known()), n=1, cutoff=0.4)

@@ -83,6 +83,13 @@ def test_latest_without_records():
     assert folders.find("latest") == known
 
 
+def test_run_that_was_killed_before_its_first_checkpoint():
+    (folder := pathlib.Path("killed")).mkdir()
+    (folder / "config.yaml").touch()
+    with pytest.raises(UserError, match="killed has no checkpoint yet; wait for its first, or"):
+        folders.find("killed")
+
+
 def test_unwritable_start_record_warns():
     pathlib.Path("runs").write_text("a file")
     with pytest.warns(match="^runs/started.txt cannot be written"):
