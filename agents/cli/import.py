@@ -92,6 +92,7 @@ def _import_own(source, path, file, scale, metres_per_pixel, marks) -> None:
         raise UserError(f"file={file} must end with .npz")
     if source == "svg" and scale is None:
         raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
+    from megastep.agents.runs import folders
     from megastep.geometries import files
     from megastep.geometries.plans import imports, sheets
 
@@ -110,7 +111,7 @@ def _import_own(source, path, file, scale, metres_per_pixel, marks) -> None:
     console.say(
         f"{g.masks.max()} rooms, {len(g.walls)} walls and {len(g.doors)} doors in {file}\n"
         f"the drawing beside the result: {sheet}\n"
-        f"use: geometry=files geometry.path={file}"
+        f"use: geometry=files {folders.quoted('geometry.path', file)}"
     )
 
 

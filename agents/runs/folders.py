@@ -205,9 +205,14 @@ def resume_command(folder: Path) -> str:
 
 def command_of(script: str, key: str, folder: Path) -> str:
     """Returns the command that does something with a run, quoted for the shell and for Hydra."""
-    is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
-    name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
-    return f"{package.command(script, 'python ')} {shlex.quote(f'{key}={name}')}"
+    return f"{package.command(script, 'python ')} {quoted(key, folder)}"
+
+
+def quoted(key: str, path: Path) -> str:
+    """Returns a setting that is a path, quoted for the shell and for Hydra."""
+    is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(path))
+    name = str(path) if is_plain else '"{}"'.format(str(path).replace('"', '\\"'))
+    return shlex.quote(f"{key}={name}")
 
 
 def to_continue(folder: Path | None) -> str:

@@ -326,6 +326,12 @@ def test_bad_own_plans(drawn, name, words, sentence, here, capsys):
     assert sentence in err and err.count("\n") <= 2 and not list(here.iterdir())
 
 
+def test_name_with_blanks_is_quoted_where_the_next_command_is_printed(here, capsys):
+    draw_plans.ros_map(here, "a", np.pad(np.full((40, 40), 254, np.uint8), 5), 0.1)
+    assert run("source=map", "path=a.yaml", "file=my home.npz") == 0
+    assert "use: geometry=files 'geometry.path=\"my home.npz\"'\n" in capsys.readouterr().out
+
+
 def test_bad_maps(here, capsys):
     black = np.zeros((50, 50), np.uint8)
     cases = {"image: ../x.png\nresolution: 1": "there is no image", "- 1": "no 'image'"}
