@@ -3,8 +3,9 @@ conversions. N environments, B lanes.
 """
 
 import itertools
+import math
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import cast
 
 import numpy as np
@@ -180,7 +181,7 @@ class Lanes:
             return None
         if isinstance(seed, (int, np.integer)):
             return int(seed) + torch.arange(self.n_lanes, device=self.device)
-        seeds = [*seed]
+        seeds = [*seed] if isinstance(seed, Iterable) else [seed]
         if len(seeds) != self.n_lanes or not all(isinstance(s, (int, np.integer)) for s in seeds):
             raise ValueError(
                 f"seed must be an integer, or {self.n_lanes} of them, one per lane, not {seed!r}"
@@ -205,7 +206,10 @@ class Lanes:
             dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
             may_follow = self._source.type == "cuda"  # the CPU reads what is there
             values = torch.as_tensor(values).to(self._source, dtype, non_blocking=may_follow)
-            return values.reshape(self.n_lanes, *space.shape).contiguous()
+            shape = self.n_lanes, *space.shape
+            if values.numel() != math.prod(shape):
+                raise ValueError(f"actions must fit {shape}, but their shape is {(*values.shape,)}")
+            return values.reshape(shape).contiguous()
 
         return arrdict(actions=spaces.map(converted, self.env.action_space, actions))
 

@@ -64,6 +64,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.env, self.num_envs, self.device = env, self.lanes.n_lanes, self.lanes.device
         self.autoreset_mode, self.to_numpy, self.copy = mode, to_numpy, copy
         self.dtype = dtype or (torch.float32 if to_numpy else torch.float16)
+        if self.dtype not in NUMPY:
+            raise ValueError(f"dtype must be one of {', '.join(map(str, NUMPY))}, not {dtype!r}")
         self.single_observation_space = gymnasium_space(env.obs_space, self.dtype)
         self.single_action_space = gymnasium_space(env.action_space, torch.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

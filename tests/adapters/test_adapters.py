@@ -168,8 +168,16 @@ def test_what_does_not_fit_is_named_in_gymnasium():
         env.reset(options={"speed": 2})
     with pytest.raises(ValueError, match=r"mask must be bool, of shape \(4,\), not torch.int64"):
         env.reset(options={"reset_mask": np.ones(4, int)})
-    with pytest.raises(ValueError, match="seed must be an integer, or 4 of them"):
-        env.reset(seed=[1, 2])
+    for seed in ([1, 2], 1.5):
+        with pytest.raises(ValueError, match="seed must be an integer, or 4 of them"):
+            env.reset(seed=seed)
+    with pytest.raises(ValueError, match=r"actions must fit \(4, 1\), but their shape is \(3,\)"):
+        env.step(np.zeros(3, int))
+    for dtype in (torch.float64, np.float32):
+        with pytest.raises(
+            ValueError, match="dtype must be one of torch.float16, torch.float32, not"
+        ):
+            adapters.VectorEnv(pong(), dtype=dtype)
     with pytest.raises(
         ValueError, match="lane . has ended its episode: in DISABLED, begin the next"
     ):
