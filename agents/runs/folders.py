@@ -167,8 +167,7 @@ def find(name: str, member: int | str | None = "best") -> Path:
         if name in agents:
             raise UserError(f"{name} {problem}; rename it to use the pretrained agent {name}")
         if (path / "config.yaml").exists():
-            text = "has no checkpoint yet; wait for its first, or start its run again"
-            raise UserError(f"{name} {text}")
+            raise UserError(f"{name} has no checkpoint yet; wait for one, or start its run again")
     elif name in agents:
         return agents[name]
     near = difflib.get_close_matches(name, map(str, known()), n=1, cutoff=0.4)

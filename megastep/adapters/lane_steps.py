@@ -137,10 +137,8 @@ class Lanes:
 
     def _require_own(self) -> None:
         if self._is_replaced:
-            raise ValueError(
-                f"this {type(self.env).__name__} was given to another adapter since, which steps "
-                "it now: make an environment for each adapter"
-            )
+            text = "was given to another adapter since; make an environment for each"
+            raise ValueError(f"this {type(self.env).__name__} {text}")
 
     def _require_masks(self, purpose) -> None:
         if not self._takes_masks:

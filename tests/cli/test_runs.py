@@ -86,7 +86,7 @@ def test_latest_without_records():
 def test_run_that_was_killed_before_its_first_checkpoint():
     (folder := pathlib.Path("killed")).mkdir()
     (folder / "config.yaml").touch()
-    with pytest.raises(UserError, match="killed has no checkpoint yet; wait for its first, or"):
+    with pytest.raises(UserError, match="killed has no checkpoint yet; wait for one, or"):
         folders.find("killed")
 
 
