@@ -107,12 +107,16 @@ DEVICE unsigned long long swizzled_matrix(const void* first) {
 
 DEVICE void begin_multiplying() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
 
-// Waits until all sums are there.
-DEVICE void end_multiplying() {
-    asm volatile("wgmma.commit_group.sync.aligned;\nwgmma.wait_group.sync.aligned 0;" ::: "memory");
-}
-
 #define FOUR(i) "+f"(sums[i][0]), "+f"(sums[i][1]), "+f"(sums[i][2]), "+f"(sums[i][3])
+#define SUMS                                                                                  \
+    FOUR(0), FOUR(1), FOUR(2), FOUR(3), FOUR(4), FOUR(5), FOUR(6), FOUR(7), FOUR(8), FOUR(9), \
+        FOUR(10), FOUR(11), FOUR(12), FOUR(13), FOUR(14), FOUR(15)
+
+// Waits until all sums are there. Compilers, too, must read them after it.
+DEVICE void end_multiplying(float (&sums)[16][4]) {
+    asm volatile("wgmma.commit_group.sync.aligned;\nwgmma.wait_group.sync.aligned 0;"
+                 : SUMS::"memory");
+}
 
 // sums (64 x 128) += a (64 x 16) b (16 x 128): the next two words of 64 rows and of 128 rows. A
 // thread has numbers 2 q and 2 q + 1 of each 8 columns, of row g of its warp's 16 and of row g + 8.
@@ -124,8 +128,7 @@ DEVICE void multiply_add(float (&sums)[16][4], unsigned long long a, unsigned lo
         "%32, %33, %34, %35, %36, %37, %38, %39, %40, %41, %42, %43, %44, %45, %46, %47, "
         "%48, %49, %50, %51, %52, %53, %54, %55, %56, %57, %58, %59, %60, %61, %62, %63}, "
         "%64, %65, 1, 1, 1, 0, 0;"
-        : FOUR(0), FOUR(1), FOUR(2), FOUR(3), FOUR(4), FOUR(5), FOUR(6), FOUR(7), FOUR(8), FOUR(9),
-          FOUR(10), FOUR(11), FOUR(12), FOUR(13), FOUR(14), FOUR(15)
+        : SUMS
         : "l"(a), "l"(b));
 }
 

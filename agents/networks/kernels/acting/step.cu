@@ -136,10 +136,11 @@ DEVICE void multiply_part(Sums<B>& sums, const unsigned char* part, const B& blo
     const unsigned char* lanes = part + block.lanes / GROUP_ROWS * GROUP_ROWS * ROW_BYTES;
     unsigned long long left = swizzled_matrix(lanes);
     unsigned long long right = swizzled_matrix(part + LANES * ROW_BYTES);
+    auto& of = (float (&)[ROWS / 8][4]) sums;
     begin_multiplying();
     for (int k = 0; k < ROW_WORDS; k += 2)
-        multiply_add((float (&)[ROWS / 8][4]) sums, left + k, right + k);
-    end_multiplying();
+        multiply_add(of, left + k, right + k);
+    end_multiplying(of);
 }
 
 #else
