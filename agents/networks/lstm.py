@@ -170,7 +170,9 @@ class _Sequence(torch.autograd.Function):
         ctx, has_grad, x, input_weight, bias, weight, reset, output, cell, is_residual
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         ctx.set_materialize_grads(False)
-        ctx.on_cpu, ctx.is_residual, ctx.is_first = x.dtype == torch.float32, is_residual, True
+        ctx.on_cpu, ctx.is_residual = x.dtype == torch.float32, is_residual
+        # hooks, such as a checkpoint's, may write what they return only when it is asked for
+        ctx.is_first = torch._C._autograd._top_saved_tensors_default_hooks(False) is None
         x, reset, output, cell = aligned(x), reset.contiguous(), aligned(output), aligned(cell)
         input_weight, bias, weight = (
             cast(w, x.dtype).contiguous() for w in (input_weight, bias, weight)

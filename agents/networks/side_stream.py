@@ -39,8 +39,10 @@ def fork(after: torch.Event | None) -> Iterator[torch.cuda.Stream | None]:
         return
     current = torch.cuda.current_stream(after.device)
     _side_of(current).wait_event(after)
-    yield _side_of(current)
-    current.wait_stream(_side_of(current))
+    try:
+        yield _side_of(current)
+    finally:  # also where what runs here is out of memory, which is then freed
+        current.wait_stream(_side_of(current))
 
 
 @contextlib.contextmanager
