@@ -5,7 +5,7 @@
     python scripts/check_kernels.py sm_100    # another architecture than that of an H200
 
 Prints a line per folder of kernels, and NVRTC's messages where it fails. Exit code 1 then. Folders
-for Hopper and later, `clusters` and `convolutions`, fail below sm_90.
+for Hopper and later, `acting`, `clusters` and `convolutions`, fail below sm_90.
 """
 
 import argparse
@@ -46,7 +46,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("architecture", nargs="?", default="sm_90")
+    parser.add_argument("architecture", nargs="?", default="sm_90a")
     architecture = parser.parse_args(argv).architecture
     failed = False
     for library in libraries():

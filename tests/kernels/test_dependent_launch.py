@@ -98,7 +98,7 @@ def ptx(library):
         compile.joined(files).encode(), b"kernels.cu", len(files), texts, names
     )
     handle = compile.check_status(made, "NVRTC")
-    flags = [*library.cuda_flags, "--gpu-architecture=compute_90"]
+    flags = [*library.cuda_flags, "--gpu-architecture=compute_90a"]
     result = nvrtc.nvrtcCompileProgram(handle, len(flags), [flag.encode() for flag in flags])
     compile.check_status(result, "NVRTC")
     text = bytearray(compile.check_status(nvrtc.nvrtcGetPTXSize(handle), "NVRTC"))
