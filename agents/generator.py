@@ -5,7 +5,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from itertools import chain, count
+from itertools import chain, repeat
 
 import torch
 
@@ -46,7 +46,7 @@ def seeded(seed: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def drawn_ahead(n_calls: int) -> Iterator[None]:
-    """Inside, `draw` draws the numbers of so many calls at once. More than 1 take a GPU."""
+    """Inside, `draw` draws the numbers of so many calls in two kernels. More than 1 take a GPU."""
     is_recording = n_calls > 1 and torch.cuda.is_current_stream_capturing()
     token = _AHEAD.set((n_calls, is_recording, {}))
     try:
@@ -65,11 +65,12 @@ def draw(
     # a graph that is recorded inside would read a block from outside again in every replay
     if n_calls == 1 or torch.cuda.is_current_stream_capturing() != was_recording:
         return fill(torch.empty(shape, device=device), generator=generator)
-    block = min(n_calls, 1 + _MAX_NUMBERS // (1 + math.prod(shape))), *shape
-    drawn = (fill(torch.empty(block, device=device), generator=generator) for _ in count())
+    # first for this call alone, as the next may have another shape
+    rows = chain((1,), repeat(min(n_calls - 1, 1 + _MAX_NUMBERS // (1 + math.prod(shape)))))
+    drawn = (fill(torch.empty(n, *shape, device=device), generator=generator) for n in rows)
     # an owner on two streams has two blocks, as streams do not wait for each other
     stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
-    key = owner, fill, block, generator, stream
+    key = owner, fill, shape, generator, stream
     return next(blocks.setdefault(key, chain.from_iterable(drawn)))
 
 

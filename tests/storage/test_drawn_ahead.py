@@ -26,8 +26,8 @@ HEADS = {
     "beta": (spaces.MultiContinuous(1, 2), dict(continuous="beta")),
     "duelling": (spaces.MultiDiscrete(1, 4), dict(output="duelling")),
 }
-#: Kernels that draw in a rollout: one a rollout and head, but of the Beta distribution one a step.
-N_DRAWS = dict(softmax=1, dict=2, many=1, gaussian=1, beta=T, duelling=1)
+#: Kernels that draw in a rollout: two a rollout and head, but of the Beta distribution one a step.
+N_DRAWS = dict(softmax=2, dict=4, many=2, gaussian=2, beta=T, duelling=2)
 EXPONENTIAL = torch.Tensor.exponential_
 
 
@@ -163,23 +163,32 @@ def test_numbers_have_their_distribution(device, fill):
 
 
 def test_owners_use_up_blocks_of_their_own(device, monkeypatch):
-    """Two blocks each for five calls; a limit on their size; nothing ahead outside."""
+    """Three blocks each for six calls; a limit on their size; nothing ahead outside."""
     monkeypatch.setattr(generators, "_MAX_NUMBERS", 40)
     generator, plain, other = (SeededGenerator(seed).on(device) for seed in (1, 1, 2))
     for shape, rows in ((3, 4), 4), ((3, 5), 3):
-        with drawn_ahead(4):
+        with drawn_ahead(5):
             draw("a", EXPONENTIAL, shape, other, device)
             ours = [
                 [draw(owner, EXPONENTIAL, shape, generator, device) for owner in "ab"]
-                for _ in range(5)
+                for _ in range(6)
             ]
-        blocks = [torch.empty(rows, *shape, device=device) for _ in range(4)]
+        blocks = [torch.empty(n, *shape, device=device) for n in (1, 1, *[rows] * 4)]
         for block in blocks:
             block.exponential_(generator=plain)
         for first, theirs in enumerate(zip(*ours, strict=True)):
-            assert torch.equal(torch.stack(theirs), torch.cat(blocks[first::2])[:5])
+            assert torch.equal(torch.stack(theirs), torch.cat(blocks[first::2])[:6])
         one = torch.empty(shape, device=device).exponential_(generator=plain)
         assert torch.equal(draw("a", EXPONENTIAL, shape, generator, device), one)
+
+
+def test_shapes_that_change_take_no_more_numbers(device):
+    """Such as those of a policy that acts for some lanes, in an environment on the host."""
+    generator, plain = (SeededGenerator(1).on(device) for _ in range(2))
+    with drawn_ahead(T):
+        for n in range(1, T):
+            numbers = draw("a", EXPONENTIAL, (n,), generator, device)
+            assert torch.equal(numbers, torch.empty(n, device=device).exponential_(generator=plain))
 
 
 def test_a_graph_that_is_recorded_meanwhile_draws_for_itself(device):
