@@ -171,8 +171,9 @@ class _Sequence(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         ctx.set_materialize_grads(False)
         ctx.on_cpu, ctx.is_residual = x.dtype == torch.float32, is_residual
-        # hooks, such as a checkpoint's, may write what they return only when it is asked for
-        ctx.is_first = torch._C._autograd._top_saved_tensors_default_hooks(False) is None
+        # checkpoints and the like write what backward reads only when a gradient is there
+        hooks = torch._C._autograd._top_saved_tensors_default_hooks(False)
+        ctx.may_fork = hooks is None and torch._C._current_graph_task_id() < 0
         x, reset, output, cell = aligned(x), reset.contiguous(), aligned(output), aligned(cell)
         input_weight, bias, weight = (
             cast(w, x.dtype).contiguous() for w in (input_weight, bias, weight)
@@ -199,8 +200,8 @@ class _Sequence(torch.autograd.Function):
         residual = d_sum if ctx.is_residual else None
         if residual is not None and not ctx.on_cpu:
             residual = residual.clone()
-        event = side_stream.ready_event(d_outputs) if d_cell is None and ctx.is_first else None
-        ctx.is_first = False  # of a retained graph, the memory for gradients may still be read
+        event = side_stream.ready_event(d_outputs) if d_cell is None and ctx.may_fork else None
+        ctx.may_fork = False  # of a retained graph, the memory for gradients may still be read
         with side_stream.fork(event) as stream, torch.cuda.stream(stream):
             d_gates, d_bias, d_output, d_cell, d_x = backward(
                 input_weight, weight, reset, saved, d_outputs, d_cell

@@ -1,6 +1,7 @@
 """An LSTM's sequence on a side stream, and what overlaps with it."""
 
 import contextlib
+import functools
 
 import pytest
 import torch
@@ -61,18 +62,32 @@ def outputs(layers, x, reset):
     return x
 
 
-@pytest.mark.parametrize("hooks", [contextlib.nullcontext, torch.autograd.graph.save_on_cpu])
-def test_sequences_of_lower_layers_wait_for_gradients_alone(monkeypatch, hooks):
-    """And for what hooks on saved tensors return, also those of `torch.utils.checkpoint`."""
+def with_hooks(call):
+    """As `torch.utils.checkpoint` does it."""
+    with torch.autograd.graph.save_on_cpu():
+        return call()
+
+
+def in_backward(call):
+    """As functions that compute a part of a network again do it."""
+    x, results = torch.ones((), requires_grad=True), []
+    x.register_hook(torch.enable_grad()(lambda _: results.append(call())))
+    x.backward()
+    return results[0]
+
+
+@pytest.mark.parametrize("way", [None, with_hooks, in_backward])
+def test_sequences_of_lower_layers_wait_for_gradients_alone(monkeypatch, way):
+    """And for what is computed or copied again before they run."""
     waited, events = [], [object() for _ in range(6)]
     points, nothing = iter(events), contextlib.nullcontext()
     monkeypatch.setattr(side_stream, "fork_point", lambda device: next(points))
     monkeypatch.setattr(side_stream, "fork", lambda after: waited.append(after) or nothing)
     reset, x = torch.zeros(2, 5, dtype=torch.bool), torch.randn(2, 5, 16, requires_grad=True)
-    with hooks():
-        y = outputs([lstm.LSTM(16) for _ in range(3)], x, reset).sum()
+    call = functools.partial(outputs, [lstm.LSTM(16) for _ in range(3)], x, reset)
+    y = (way(call) if way else call()).sum()
     y.backward(retain_graph=True)
-    assert waited == [None, *(events[:2] if hooks is contextlib.nullcontext else [None] * 2)]
+    assert waited == [None, *([None] * 2 if way else events[:2])]
     y.backward()  # the first one may still read the memory for gradients
     assert waited[3:] == [None] * 3
 
