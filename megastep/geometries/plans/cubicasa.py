@@ -8,7 +8,6 @@ class Floorplan; floors lie side by side, all but the first hidden.
 from collections.abc import Iterator
 from xml.etree.ElementTree import Element
 
-import shapely
 from svgelements import Matrix
 
 from megastep.geometries.plans import outlines, safe
@@ -67,7 +66,7 @@ def _collect(element, matrix, drawing) -> None:
             rooms = drawing.outdoors if "Outdoor" in words else drawing.rooms
             parts = _polygons(child, inner)
             if parts:
-                rooms.append(shapely.union_all(parts))
+                rooms.append(outlines.union(parts))
         elif "Column" in words:
             drawing.walls.extend(_polygons(child, inner))
         else:

@@ -59,6 +59,11 @@ def polygons(shape: BaseGeometry) -> list[Polygon]:
     return [part for part in nested if isinstance(part, Polygon) and part.area > 1e-6]
 
 
+def union(shapes: Sequence[BaseGeometry]) -> BaseGeometry:
+    """Returns the union of shapes as drawn. GEOS may lose shapes that touch, unless on a grid."""
+    return shapely.set_precision(shapely.union_all(shapes, grid_size=1e-9), 0)
+
+
 def ring(points: np.ndarray) -> list[Polygon]:
     """Returns the polygons that a ring of points (P, 2) encloses: none for fewer than 3."""
     return polygons(Polygon(points)) if len(points) >= 3 else []
@@ -131,7 +136,7 @@ def geometry_of(
     if not drawing.walls and drawing.floor is None:
         raise ValueError("it has no wall")
     check_extent([*drawing.walls, *rooms])
-    solids = shapely.union_all(drawing.walls)
+    solids = union(drawing.walls)
     openings, n_sealed = drawing.doors, 0
     if sealed and drawing.floor is None:
         openings, n_sealed = _openings(drawing, solids, rooms)
@@ -310,7 +315,7 @@ def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Dr
     1.3 m in the outer walls are closed if the floor leaks through them. Raises ValueError.
     """
     check_meetings([*walls, *doors])
-    solids = shapely.union_all(walls)
+    solids = union(walls)
     check_extent([solids])
     closed = shapely.union_all([solids, *(door.buffer(JAMB, **MITRE) for door in doors)])
     hull = filled(closed)
