@@ -26,7 +26,7 @@ class GlobalGenerators:
     """The global generators as one environment finds them, each at a place of its own."""
 
     def __init__(self, seed: Sequence[int]):
-        sequence = np.random.SeedSequence(seed)
+        sequence = np.random.SeedSequence([*seed, 1])  # a 0 at the end would count for nothing
         self.numpy = np.random.Generator(np.random.MT19937(sequence))
         self.python = random.Random(int(sequence.generate_state(1)[0]))
         self.torch, self.torch_seed = None, int(sequence.generate_state(2)[1])

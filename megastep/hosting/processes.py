@@ -129,7 +129,7 @@ class VectorProcesses:
 
 def _serve(pipe, make, rows, seed) -> None:
     """Answers commands until the pipe is closed, which it is when the other process ends."""
-    global_seed = int(np.random.SeedSequence([seed, rows.start]).generate_state(1)[0])
+    global_seed = int(np.random.SeedSequence([seed, rows.start, 2]).generate_state(1)[0])
     np.random.seed(global_seed)  # for what draws too rarely to be found by a probe
     random.seed(global_seed)
     envs: Any = None

@@ -2,6 +2,8 @@
 their spaces or Gymnasium's interface do not allow.
 """
 
+import random
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +15,7 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium import spaces  # noqa: E402
 
 from megastep.envs import Gymnasium  # noqa: E402
+from megastep.global_generators import GlobalGenerators  # noqa: E402
 from megastep.hosting.env_error import BadValue, EnvError  # noqa: E402
 from megastep.hosting.hosted import HostedEnvs  # noqa: E402
 from megastep.hosting.probe import beyond_bounds, probe  # noqa: E402
@@ -77,6 +80,14 @@ def test_the_try_leaves_global_generators_alone():
     expected = np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()
     assert probe(Draws).generators == ("numpy", "torch")
     assert (np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()) == expected
+
+
+def test_global_generators_do_not_draw_what_environments_draw():
+    """NumPy takes [seed, 0] for the seed, which those of environments come from."""
+    seeds = np.random.SeedSequence(3).generate_state(2).tolist()
+    generators = GlobalGenerators([3, 0])
+    assert generators.python.random() != random.Random(seeds[0]).random()
+    assert generators.torch_seed != seeds[1]
 
 
 # ---- Frames ----
