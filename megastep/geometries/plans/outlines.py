@@ -85,7 +85,7 @@ def check_meetings(shapes: Sequence[BaseGeometry], before: int = 0) -> int:
 def area_of(rings: Sequence[np.ndarray], is_even_odd: bool = False) -> BaseGeometry:
     """Returns the area that rings (P, 2) enclose by one of SVG's fill rules."""
     lines = [shapely.LinearRing(points) for points in rings]
-    faces = shapely.get_parts(shapely.polygonize([shapely.union_all(lines)]))
+    faces = shapely.get_parts(shapely.polygonize([union(lines)]))
     points = shapely.get_coordinates(shapely.point_on_surface(faces))
     edges = np.concatenate([np.stack([r, np.roll(r, -1, 0)], 1) for r in rings])
     (x0, y0), (x1, y1) = edges[:, 0].T, edges[:, 1].T
@@ -95,7 +95,7 @@ def area_of(rings: Sequence[np.ndarray], is_even_odd: bool = False) -> BaseGeome
         n_up, n_down = is_left & (y0 <= y) & (y < y1), ~is_left & (y1 <= y) & (y < y0)
         winding = int(n_up.sum()) - int(n_down.sum())
         inside.append(winding % 2 == 1 if is_even_odd else winding != 0)
-    return shapely.union_all(faces[np.array(inside, bool)])
+    return union(faces[np.array(inside, bool)].tolist())
 
 
 def filled(shape: BaseGeometry) -> BaseGeometry:
