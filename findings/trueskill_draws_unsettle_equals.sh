@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # trueskill 0.4.5: with draw_probability=0, for games that always have a winner, a draw of two equals, as when a time
 # limit ends a duel after all, makes both less certain than they were, and the next one again. Its formula has a
-# margin of nothing then and divides two rounding errors. Draws of unequal players are rated well, and all with 0.0001.
+# margin of 2e-7 then, and divides by a rounding error below 0. Draws of unequal players are rated well, all with 0.0001.
 # By hand: both of N(25, 8.333^2 + 0.083^2) were equally good within noise of 4.167, so that the variance v becomes
 # v (1 - v / (2 v + 2 * 4.167^2)), and sigma 6.455. Seen: 9.59, 10.84, 12.09, 13.33 after four draws.
 set -euo pipefail
