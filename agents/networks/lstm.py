@@ -172,7 +172,7 @@ class _Sequence(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.on_cpu, ctx.is_residual = x.dtype == torch.float32, is_residual
         # checkpoints and the like write what backward reads only when a gradient is there
-        hooks = torch._C._autograd._top_saved_tensors_default_hooks(False)
+        hooks = torch._C._autograd._top_saved_tensors_default_hooks(False)  # pyright: ignore[reportAttributeAccessIssue]
         ctx.may_fork = hooks is None and torch._C._current_graph_task_id() < 0
         x, reset, output, cell = aligned(x), reset.contiguous(), aligned(output), aligned(cell)
         input_weight, bias, weight = (

@@ -226,7 +226,7 @@ def test_signal_saves_once_and_a_resumed_run_has_one_voice(
     assert train.main(["resume=run", f"samples={total}", *finish]) == 0  # with two ranks again
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == total
     out, err = capfd.readouterr()
-    assert not err and out.count("samples ·") == out.count("8 episodes") == 1
+    assert not err and out.count("samples ·") == out.count("minimal: 8 episodes") == 1
     rows = json_lines.read(here / "run" / "metrics.jsonl")
     assert [row["updates"] for row in rows] == [*range(1, total // update + 1)]
 
