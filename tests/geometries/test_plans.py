@@ -557,6 +557,9 @@ def test_what_is_not_read_of_a_drawing_is_said():
     }.items():
         _, (warning,) = imports.svg.read(text.replace('<g id="wall">', change).encode(), 0.001)
         assert warning.startswith("not read, ") and words in warning
+    nested = text.replace("<g ", "<svg><g ").replace("</g>", "</g></svg>")
+    with pytest.raises(ValueError, match="no shape is marked 'wall'.*; not read: 1 times svg"):
+        imports.svg.read(nested.encode(), 0.001)
 
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 100">{}</svg>'

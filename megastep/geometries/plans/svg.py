@@ -83,13 +83,14 @@ def read(
     ValueError.
     """
     reader = _Reader(safe.svg(content), scale, {"walls": walls, "doors": doors})
+    unread = ", ".join(f"{n} times {name}" for name, n in reader.unread.items())
     if not reader.shapes["walls"]:
         raise ValueError(
             f"no shape is marked {walls!r} by id, class or label; walls= names another mark"
+            + bool(unread) * f"; not read: {unread}"
         )
     outlines.check_extent(reader.shapes["walls"])
-    unread = [f"{n} times {name}" for name, n in reader.unread.items()]
-    warnings = [f"not read, so drawn otherwise in a browser: {', '.join(unread)}"] * bool(unread)
+    warnings = [f"not read, so drawn otherwise in a browser: {unread}"] * bool(unread)
     return outlines.enclosed(reader.shapes["walls"], reader.shapes["doors"]), warnings
 
 
