@@ -139,7 +139,8 @@ def _interval(name, values, groups) -> dict[str, float]:
 
 def difference(played: Mapping, other: Mapping) -> arrdict:
     """Returns the episodes of one player less those of another that began alike, as pairs."""
-    pairs = arrdict(played, done=played["done"] & other["done"])
+    both = _counted(played) & _counted(other)
+    pairs = arrdict(played, done=played["done"] & other["done"], learns=both)
     for name in ("returns", "lengths", "metrics"):
         pairs[name] = played[name] - other[name]
     return pairs

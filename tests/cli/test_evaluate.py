@@ -114,6 +114,15 @@ def test_summaries_by_role():
     assert (leader["role"], follower["role"]) == ("leader", "follower") and "role" not in every
 
 
+def test_pairs_are_of_episodes_that_both_played():
+    """The other's third episode is of an agent that was not there."""
+    returns, envs = torch.tensor([[8.0, 8.0, 8.0], [5.0, 5.0, 0.0]]), torch.arange(3)
+    own, other = (episodes_of(row, envs, metrics=arrdict()) for row in returns)
+    other["learns"] = envs < 2
+    (row,) = statistics.summaries(statistics.difference(own, other))
+    assert (row["return"], row["upper"], row["lanes"]) == (3, 3, 2)
+
+
 def test_nonfinite_metric_is_left_out_of_its_mean():
     """Of `laps`, a half has no number; of `falls`, no episode has one."""
     laps = torch.tensor([2.0, torch.nan, 4.0, torch.inf])
