@@ -52,10 +52,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         copy: bool = True,
         render_mode: str | None = None,
     ):
-        modes = AutoresetMode.__members__
-        mode = modes.get(getattr(autoreset_mode, "name", str(autoreset_mode)).upper())
+        name = getattr(autoreset_mode, "name", str(autoreset_mode)).upper()
+        mode = next((m for m in AutoresetMode if name in (m.name, m.value.upper())), None)
         if mode is None:
-            names = ", ".join(modes)
+            names = ", ".join(AutoresetMode.__members__)
             raise ValueError(f"autoreset_mode must be one of {names}, not {autoreset_mode!r}")
         needs_masks = mode is not AutoresetMode.NEXT_STEP
         purpose = f"autoreset_mode={mode.name}" if needs_masks else None

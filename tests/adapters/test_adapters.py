@@ -156,6 +156,7 @@ def test_what_does_not_fit_is_named_in_gymnasium():
         name = mode.upper()
         with pytest.raises(ValueError, match=f"autoreset_mode={name} needs reset.*docs/new-env"):
             adapters.VectorEnv(Numbers(), mode)
+    assert adapters.VectorEnv(pong(), SAME.value).autoreset_mode is SAME  # "SameStep"
     with pytest.raises(ValueError, match="must be one of NEXT_STEP, SAME_STEP, DISABLED, not 'on'"):
         adapters.VectorEnv(pong(), "on")
     with pytest.raises(ValueError, match="a seed or a mask needs reset.*does not have"):
