@@ -63,17 +63,6 @@ OptimizerName = Annotated[
 ]
 
 
-class LearnerError(AssertionError):
-    """A class does not keep the contract of learners. The message names the missing attribute."""
-
-
-def check_learner(learner: object) -> None:
-    """Raises LearnerError if a required attribute is missing."""
-    for name in ("collector", "update", "lr", "state_dict", "load_state_dict"):
-        if not hasattr(learner, name):
-            raise LearnerError(f"it has no {name}: see docs/learners.md, Writing a learner")
-
-
 class GradientLearner:
     """Base of the built-in learners: policy, gradient steps, CUDA graph, learning rate and state.
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from megastep import contract, devices, engine, scene, spaces, types
-from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, components, settings
@@ -41,7 +40,7 @@ SAMPLE, SAMPLE_STEPS = 4, 16
 #: What the library raises for bad arguments, files and devices, and for too little memory.
 KINDS = (
     *(ValueError, OSError, torch.OutOfMemoryError, engine.EngineError, contract.ContractError),
-    *(checkpoint.CheckpointError, loggers.LoggerError, LearnerError),
+    *(checkpoint.CheckpointError, loggers.LoggerError),
 )
 #: Turns these errors into a UserError that begins with a prefix. For setting up.
 errors = functools.partial(user_errors, kinds=KINDS)
@@ -194,9 +193,13 @@ def make_policy(agent: Agent, env: types.Env, seed: int = 1, critic: str | None 
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> "agent_types.Learner":
     learner = construct(settings, policy=policy, seed=seed, graph=True)
     if not settings.name.startswith("megastep."):
-        with errors(f"{settings.name} is not a learner: "):
-            check_learner(learner)
-        with user_errors(f"{settings.name} is not a learner: ", (TypeError,)):
+        problem = f"{settings.name} is not a learner"
+        for name in ("collector", "update", "lr", "state_dict", "load_state_dict"):
+            if not hasattr(learner, name):
+                raise UserError(
+                    f"{problem}: it has no {name}: see docs/learners.md, Writing a learner"
+                )
+        with user_errors(f"{problem}: ", (TypeError,)):
             check_plain(learner.state_dict(), "state_dict")
     return learner
 
