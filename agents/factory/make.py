@@ -22,7 +22,6 @@ from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.runs.saver import check_plain, nbytes
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.opponents import Opponents
-from megastep.agents.training import loggers
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.capture import state_tree
 from megastep.imports import import_object
@@ -40,7 +39,7 @@ SAMPLE, SAMPLE_STEPS = 4, 16
 #: What the library raises for bad arguments, files and devices, and for too little memory.
 KINDS = (
     *(ValueError, OSError, torch.OutOfMemoryError, engine.EngineError, contract.ContractError),
-    *(checkpoint.CheckpointError, loggers.LoggerError),
+    checkpoint.CheckpointError,
 )
 #: Turns these errors into a UserError that begins with a prefix. For setting up.
 errors = functools.partial(user_errors, kinds=KINDS)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from megastep.agents.errors import UserError
 from megastep.agents.runs import json_lines
-from megastep.agents.training import loggers
 from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.loggers.csv import CSV
 from megastep.agents.training.loggers.tensorboard import TensorBoard
@@ -113,7 +113,7 @@ def test_run_resumes_after_damage_to_any_byte(tmp_path):
 def test_full_disk_on_resume_leaves_the_file(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(lines(1000))
-    with faults.full_disk(5000), pytest.raises(loggers.LoggerError, match="File too large"):
+    with faults.full_disk(5000), pytest.raises(UserError, match="File too large"):
         Loggers(tmp_path, step=900)
     assert path.read_bytes() == lines(1000)
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]

@@ -11,18 +11,14 @@ import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from megastep.agents.errors import shortened
+from megastep.agents.errors import UserError, shortened
 from megastep.agents.runs.json_lines import JsonLines, truncate_after
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import Logger, RunResult
 
 
-class LoggerError(RuntimeError):
-    """The metrics of a run cannot be written. The message names the cure."""
-
-
 class Loggers:
-    """All loggers of one run. Raises LoggerError: the files cannot be written. They are unchanged.
+    """All loggers of one run. Raises UserError: the files cannot be written. They are unchanged.
     Any logger beside the JSON lines is dropped with a warning when it cannot be made or fails.
 
     Args:
@@ -44,7 +40,7 @@ class Loggers:
                 truncate_after(path, step)
             self.metrics, self.perf = (JsonLines(path) for path in paths)
         except OSError as error:
-            raise LoggerError(
+            raise UserError(
                 f"The metrics in {folder} cannot be written ({error.strerror}) and are unchanged. "
                 "Free some space or get write access, then start again"
             ) from error
