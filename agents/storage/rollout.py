@@ -152,14 +152,15 @@ class Rollout:
         return pairs
 
     def _of_world(self, t, world) -> Pairs:
-        pairs = [*_pairs(self.obs, t, world["obs"]), (self.starts[t], world["reset"])]
+        rows = self._seen()
         if "learns" in world:
-            pairs.append((self.learns[t], world["learns"]))
-        if self.privileged is not None:
-            pairs += _pairs(self.privileged, t, world["privileged"])
-        if self.mask is not None:
-            pairs += _pairs(self.mask, t, world["mask"])
-        return pairs
+            rows["learns"] = self.learns
+        return [pair for name, leaf in rows.items() for pair in _pairs(leaf, t, world[name])]
+
+    def _seen(self) -> dict[str, Tree]:
+        """Returns what policies and critics see of a world, at all times."""
+        rows = dict(obs=self.obs, reset=self.starts, privileged=self.privileged, mask=self.mask)
+        return {name: leaf for name, leaf in rows.items() if leaf is not None}
 
     # ---- Lanes of the environment and lanes of the rollout ----
 
@@ -191,12 +192,7 @@ class Rollout:
         """Returns the policy's input at time t: arrdict(obs, reset), and privileged and mask if
         stored.
         """
-        world = arrdict(obs=self.obs[t], reset=self.starts[t])
-        if self.privileged is not None:
-            world["privileged"] = self.privileged[t]
-        if self.mask is not None:
-            world["mask"] = self.mask[t]
-        return world
+        return arrdict(self._seen())[t]
 
     def floats(self) -> dict[str, torch.Tensor]:
         """Returns every tensor that may become non-finite, by name: (T, B) or (T+1, B, ...)."""
