@@ -56,8 +56,8 @@ class DatasetCollector:
         masks = {name: rows for name, rows in self.columns.items() if name.startswith("mask")}
         if masks:
             shape = rollout.n_steps + 1, rollout.n_lanes
-            zeros = {k: v.new_ones(*shape, *_mask_shape(v[0])) for k, v in masks.items()}
-            rollout.mask = spaces.nested(zeros)["mask"]
+            ones = {k: v.new_ones(*shape, *torch.atleast_2d(v[0]).shape) for k, v in masks.items()}
+            rollout.mask = spaces.nested(ones)["mask"]
 
     @torch.no_grad()
     def __call__(self) -> Rollout:
@@ -97,10 +97,6 @@ class DatasetCollector:
         copy_tree(self.rollout.state, state["state"])
         for name in "row", "last", "n_taken":
             setattr(self, name, state[name].to(self.row.device))
-
-
-def _mask_shape(row) -> tuple[int, ...]:
-    return (1, *row.shape) if row.ndim == 1 else tuple(row.shape)
 
 
 def _read(dataset) -> tuple[dict[str, np.ndarray], list[int]]:
