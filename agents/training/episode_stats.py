@@ -189,13 +189,6 @@ class EpisodeStats:
             stats |= {name: n for name, n in by_name.items() if name not in stats}
         return stats
 
-    @property
-    def names(self) -> list[str]:
-        """The means that `pop` may return, without `episode/`."""
-        of_all = ["return", "length", *self.metrics]
-        parts = *self.groups, *self.sources
-        return [*of_all, *(f"{name}/{part}" for part in parts for name in of_all)]
-
     def _means(self, report, totals) -> dict[str, float]:
         """Returns counts and means by name from the sums of a report and those of a window."""
         n, returns, _, lengths, *metrics = totals
@@ -279,8 +272,10 @@ class Episodes:
     @property
     def names(self) -> list[str]:
         """The means over episodes that reports may have, without `episode/`."""
+        of_all, parts = ["return", "length", *self.stats.metrics], self.stats.groups
+        of_parts = [f"{name}/{x}" for x in (*parts, *self.stats.sources) for name in of_all]
         kinds = [] if self.opponents is None else [*self.opponents.matchups]
-        return [*self.stats.names, *(f"won/{kind}" for kind in kinds if kind != "now")]
+        return [*of_all, *of_parts, *(f"won/{kind}" for kind in kinds if kind != "now")]
 
     def on_update(self, trainer: Trainer, losses: object) -> None:
         """Counts episodes, and has curriculum and opponents learn from them."""
