@@ -16,11 +16,6 @@ from megastep.agents.types import Learner, StateDict
 from megastep.settings import checked
 from megastep.types import Env, optional
 
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Rate = Annotated[float, Field(gt=0, le=1)]
-Temperature = Annotated[float, Field(ge=0.01, le=1000)]
-Updates = Annotated[int, Field(ge=1, le=1_000_000)]
-
 #: The metrics whose sum, cut to [0, 1], is the outcome of an episode: those of the first row that
 #: an environment has. In Deathmatch a duel is decided if somebody was killed.
 OUTCOMES = ("success",), ("coverage",), ("kills", "deaths")
@@ -65,10 +60,10 @@ class SFL:
         rollout: SkipValidation[Rollout],
         sources: SkipValidation[Sequence[str]] | None = None,
         *,
-        uniform: Fraction = 0.5,
-        temperature: Temperature = 1.0,
-        lr: Rate = 0.05,
-        every: Updates = 1,
+        uniform: Annotated[float, Field(ge=0, le=1)] = 0.5,
+        temperature: Annotated[float, Field(ge=0.01, le=1000)] = 1.0,
+        lr: Annotated[float, Field(gt=0, le=1)] = 0.05,
+        every: Annotated[int, Field(ge=1, le=1_000_000)] = 1,
     ):
         weigh = optional(env, "weigh_layouts")
         if weigh is None or optional(env, "layout") is None:
