@@ -159,10 +159,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         is_same = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._ended = np.zeros_like(self._ended) if is_same else parts["over"]
         if is_same and parts["over"].any():
-            last, parts["final_obs"] = (
-                parts["final_obs"],
-                np.full(self.num_envs, None, dtype=object),
-            )
+            last = parts["final_obs"]
+            parts["final_obs"] = np.full(self.num_envs, None, dtype=object)
             kind = NUMPY[self.dtype]
             cast = mapping(lambda leaf: leaf.astype(kind if leaf.dtype.kind == "f" else leaf.dtype))
             for lane in np.flatnonzero(parts["over"]):
