@@ -43,7 +43,6 @@ class NonFiniteValue:
         step: environment step since `reset`, from 1: the one that returned the number or, if the
             policy produced it, the one that it chose an action for. 0 if `reset` returned it.
         size: magnitude of the number.
-        rollout: number of the rollout, from 1.
         n_lanes: number of lanes of the rollout with such numbers.
         n_agents: lanes per environment.
     """
@@ -52,7 +51,6 @@ class NonFiniteValue:
     lane: int
     step: int
     size: float
-    rollout: int = 1
     n_lanes: int = 1
     n_agents: int = 1
 
@@ -191,7 +189,7 @@ class NonFiniteCheck:
         row, i = divmod(row, len(floats))
         size = math.nan if size < 0 else math.inf if size > torch.finfo(torch.float32).max else size
         step = (int(rollout) - 1) * n_steps + row
-        value = NonFiniteValue(list(floats)[i], lane, step, size, int(rollout), int(n_bad))
+        value = NonFiniteValue(list(floats)[i], lane, step, size, int(n_bad))
         return value, int(n_skipped)
 
 
