@@ -2,7 +2,6 @@
 
 import collections
 import enum
-import io
 import random
 
 import numpy as np
@@ -11,6 +10,7 @@ import torch
 
 from megastep.capture import HostState
 from megastep.env_state import EnvState
+from tests.helpers.weights import reloaded
 
 
 class Colour(enum.Enum):
@@ -109,10 +109,7 @@ def test_everything_is_restored_and_goes_on(n_steps_of_target):
     env = Env()
     state = EnvState(env)
     env.step(), env.step()
-    file = io.BytesIO()
-    torch.save(state.state_dict(), file)  # as a checkpoint does
-    file.seek(0)
-    saved = torch.load(file, weights_only=True)
+    saved = reloaded(state.state_dict())
     expected, draws = str(facts(env)), [env.step(), env.draw()]
     target = restored(saved, n_steps_of_target)
     assert str(facts(target)) == expected

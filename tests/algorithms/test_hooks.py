@@ -1,6 +1,5 @@
 """What a user changes in a learner: a loss of one's own, schedules, the optimizer."""
 
-import io
 import pathlib
 import re
 import sys
@@ -20,6 +19,7 @@ from megastep.arrdict import arrdict
 from tests.helpers import headed, pages
 from tests.helpers.made_up import PRIVILEGED, Numbers, made_up, weights
 from tests.helpers.tiny import ON_GPU, TINY
+from tests.helpers.weights import reloaded
 
 PAGE = pages.ROOT / "docs" / "hooks.md"
 T = 5
@@ -47,11 +47,8 @@ def test_a_head_of_ones_own_learns_and_is_saved_with_the_learner(kind):
     assert all(error.isfinite() for error in errors[-2:])
     assert all(not torch.equal(a, b) for a, b in zip(before, learner.extra))
     assert not any("head" in name for name in policy.state_dict())
-    file = io.BytesIO()
-    torch.save(learner.state_dict(), file)
-    file.seek(0)
     _, resumed, _ = make(kind)
-    resumed.load_state_dict(torch.load(file, weights_only=True))
+    resumed.load_state_dict(reloaded(learner.state_dict()))
     assert all(torch.equal(a, b) for a, b in zip(learner.extra, resumed.extra))
     plain = kind.__mro__[2]
     with pytest.raises(ValueError, match="extra_parameters.. have shapes"):
@@ -235,13 +232,9 @@ def test_optimizers_learn_and_resume_bit_for_bit(name):
         learner.update(collect())
     assert not torch.equal(weights(policy), start)
     assert learner.optimizer.capturable == (":" not in name)
-    file = io.BytesIO()
-    torch.save(dict(policy=policy.state_dict(), learner=learner.state_dict()), file)
-    file.seek(0)
-    saved = torch.load(file, weights_only=True)
     other, resumed, _ = make(**settings)
-    other.load_state_dict(saved["policy"])
-    resumed.load_state_dict(saved["learner"])
+    other.load_state_dict(reloaded(policy.state_dict()))
+    resumed.load_state_dict(reloaded(learner.state_dict()))
     rollout = collect()
     learner.update(rollout)
     resumed.update(rollout)

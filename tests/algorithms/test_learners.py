@@ -3,7 +3,6 @@ tests that they learn.
 """
 
 import copy
-import io
 
 import pytest
 import reference
@@ -19,6 +18,7 @@ from tests.helpers.learners import LEARNERS
 from tests.helpers.made_up import PRIVILEGED, B, Numbers, made_up, weights
 from tests.helpers.synchronisation import no_synchronisation
 from tests.helpers.tiny import TINY, UPDATE
+from tests.helpers.weights import reloaded
 
 T = 5
 SMALL = dict(width=8, n_steps=T, n_minibatches=2, lr=1e-2)
@@ -56,10 +56,7 @@ def test_state_dict_resumes_bit_for_bit(name):
     for _ in range(4):
         learner.update(collect())
     learner.set_lr(2e-3)
-    file = io.BytesIO()
-    torch.save(dict(policy=policy.state_dict(), learner=learner.state_dict()), file)
-    file.seek(0)
-    saved = torch.load(file, weights_only=True)
+    saved = reloaded(dict(policy=policy.state_dict(), learner=learner.state_dict()))
     other, resumed, _ = make(name, seed=9, lr=0.5)
     if getattr(learner, "replay_buffer", None) is not None:
         resumed.replay_buffer = copy.deepcopy(learner.replay_buffer)

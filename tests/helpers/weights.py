@@ -1,4 +1,6 @@
-"""Weights of modules and of runs, to compare."""
+"""Weights of modules and of runs: copies, and comparisons."""
+
+import io
 
 import torch
 
@@ -12,6 +14,14 @@ def of_run(folder):
 
 def copied(module):
     return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def reloaded(state):
+    """Returns a state that was saved and loaded as a checkpoint's is."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
 
 
 def same(a, b):

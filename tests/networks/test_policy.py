@@ -1,7 +1,6 @@
 """The policy: steps match an unroll over the sequence, and a seed determines everything."""
 
 import copy
-import io
 
 import pytest
 import torch
@@ -13,7 +12,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, stack
 from megastep.dotdict import leaves, mapping
 from tests.helpers.synchronisation import no_synchronisation
-from tests.helpers.weights import same
+from tests.helpers.weights import reloaded, same
 
 T, B = 7, 5
 OBS = arrdict(rgb=spaces.MultiImage(1, 3, 1, 16), imu=spaces.MultiVector(1, 3))
@@ -111,10 +110,7 @@ def test_weights_of_a_seed_are_the_same_with_any_number_of_threads():
 def test_weights_load_with_weights_only():
     policy, twin = Policy(OBS, MOVES, width=32, seed=1), Policy(OBS, MOVES, width=32, seed=2)
     policy.critic.output.update_stats(torch.tensor([1.0, 9.0]), torch.tensor([True, True]))
-    file = io.BytesIO()
-    torch.save(policy.state_dict(), file)
-    file.seek(0)
-    twin.load_state_dict(torch.load(file, weights_only=True))
+    twin.load_state_dict(reloaded(policy.state_dict()))
     world = worlds()
     outputs, expected = (p.unroll(world.obs, world.reset, p.initial(B)) for p in (policy, twin))
     assert torch.equal(policy.value(outputs.features), twin.value(expected.features))
