@@ -1,5 +1,6 @@
 """Weights of modules and of runs: copies, and comparisons."""
 
+import copy
 import io
 
 import torch
@@ -22,6 +23,17 @@ def reloaded(state):
     torch.save(state, file)
     file.seek(0)
     return torch.load(file, weights_only=True)
+
+
+def moved(module, to_gpu):
+    """Returns a copy of a module with its tensors on a GPU."""
+    module = copy.deepcopy(module)
+    for part in module.modules():
+        for name, buffer in [*part.named_buffers(recurse=False)]:
+            setattr(part, name, to_gpu(buffer))
+        for name, leaf in [*part.named_parameters(recurse=False)]:
+            setattr(part, name, torch.nn.Parameter(to_gpu(leaf.detach())))
+    return module
 
 
 def same(a, b):

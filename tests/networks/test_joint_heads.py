@@ -2,7 +2,6 @@
 stands for one.
 """
 
-import copy
 import functools
 
 import pytest
@@ -14,6 +13,7 @@ from megastep.agents.networks import heads
 from megastep.agents.networks import linear as linear_module
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.fused import plain_operations
+from tests.helpers.weights import moved
 
 BF16 = torch.bfloat16
 # rows, predicted numbers, agents, choices, width: one row; a last strip that is short, and two
@@ -35,17 +35,6 @@ def modules(n_predicted, n_agents, n_choices, width):
     critic.output.scale.fill_(2.5)
     critic.output.mean.fill_(-1.5)
     return output, critic, prediction
-
-
-def moved(module, to_gpu):
-    """Returns a copy on a GPU."""
-    module = copy.deepcopy(module)
-    for part in module.modules():
-        for name, buffer in [*part.named_buffers(recurse=False)]:
-            setattr(part, name, to_gpu(buffer))
-        for name, leaf in [*part.named_parameters(recurse=False)]:
-            setattr(part, name, torch.nn.Parameter(to_gpu(leaf.detach())))
-    return module
 
 
 @pytest.fixture

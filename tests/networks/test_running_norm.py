@@ -7,6 +7,7 @@ import torch
 
 from megastep import spaces
 from megastep.agents.networks.running_norm import RunningNorm, add_moments, moments_of
+from tests.helpers.weights import moved
 
 
 def update(norm, *observations):
@@ -56,10 +57,7 @@ def test_gpu_adds_the_same_moments_of_bytes_and_doubles(to_gpu):
 def check_gpu(to_gpu, dtype):
     space = [spaces.MultiImage(1, 3, 2, 8), spaces.MultiVector(1, 5), spaces.MultiVector(2, 3)]
     norms = [RunningNorm(leaf) for leaf in space]
-    on_gpu = [RunningNorm(leaf) for leaf in space]
-    for norm in on_gpu:
-        for name, buffer in [*norm.named_buffers()]:
-            setattr(norm, name, to_gpu(buffer))
+    on_gpu = [moved(norm, to_gpu) for norm in norms]
     for seed in range(3):
         torch.manual_seed(seed)
         obs = [torch.randn(1000, *leaf.shape) * 3 + 1 for leaf in space]
@@ -69,10 +67,10 @@ def check_gpu(to_gpu, dtype):
         if seed == 1:
             obs[2][int(is_counted.nonzero()[0])] = torch.nan
         add_moments(norms, moments_of(norms, obs, is_counted))
-        moved = [to_gpu(leaf) for leaf in obs]
-        add_moments(on_gpu, moments_of(on_gpu, moved, to_gpu(is_counted)))
-    add_moments(on_gpu, moments_of(on_gpu, moved, False))
-    add_moments(on_gpu, moments_of(on_gpu, moved), to_gpu(torch.tensor(False)))
+        there = [to_gpu(leaf) for leaf in obs]
+        add_moments(on_gpu, moments_of(on_gpu, there, to_gpu(is_counted)))
+    add_moments(on_gpu, moments_of(on_gpu, there, False))
+    add_moments(on_gpu, moments_of(on_gpu, there), to_gpu(torch.tensor(False)))
     assert [norm.count.item() for norm in on_gpu] == [3, 3, 2]
     for norm, other in zip(norms, on_gpu, strict=True):
         for name in ("mean", "scale", "count"):

@@ -1,12 +1,12 @@
 """PopArt: updating the statistics of returns keeps the predictions."""
 
-import copy
 import math
 
 import pytest
 import torch
 
 from megastep.agents.networks.value_output import ValueOutput
+from tests.helpers.weights import moved
 
 WIDTH, VALID = 24, torch.ones(64, dtype=torch.bool)
 
@@ -70,17 +70,6 @@ def test_nonfinite_returns_change_nothing(bad):
     # 1e30 is finite, its square is not
     value.update_stats(torch.tensor([1.0, 2.0, bad]), torch.tensor([True, True, True]))
     assert all(torch.equal(value.state_dict()[name], before[name]) for name in before)
-
-
-def moved(output, to_gpu):
-    """Returns a copy whose weights and statistics are on a GPU."""
-    output = copy.deepcopy(output)
-    for module in output.modules():
-        for name, buffer in [*module.named_buffers(recurse=False)]:
-            setattr(module, name, to_gpu(buffer))
-        for name, leaf in [*module.named_parameters(recurse=False)]:
-            setattr(module, name, torch.nn.Parameter(to_gpu(leaf.detach())))
-    return output
 
 
 def test_a_gpu_adds_the_same_moments(to_gpu):
