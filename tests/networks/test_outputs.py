@@ -11,25 +11,11 @@ from megastep.agents.networks import duelling_output, heads
 from megastep.agents.networks import linear as linear_module
 from megastep.agents.networks.fused import plain_operations
 from megastep.arrdict import arrdict
+from tests.helpers.weights import moved
 
-IMAGE = spaces.MultiImage(2, 3, 1, 16)
-DEPTH = spaces.MultiImage(2, 1, 1, 16)
-VECTOR = spaces.MultiVector(2, 5)
-TREE = arrdict(eyes=arrdict(rgb=IMAGE, d=DEPTH), imu=VECTOR, team=spaces.MultiDiscrete(2, 4))
+IMAGE, VECTOR = spaces.MultiImage(2, 3, 1, 16), spaces.MultiVector(2, 5)
 MOVES = arrdict(movement=spaces.MultiDiscrete(2, 7), fire=spaces.MultiDiscrete(2, 2))
 WIDTH = 24
-
-
-def random_obs(space, *lead, seed=0, dtype=torch.float32):
-    """Returns a random observation of a space."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def leaf(child):
-        if isinstance(child, spaces.MultiDiscrete):
-            return torch.randint(child.n_actions, (*lead, *child.shape), generator=generator)
-        return torch.rand(*lead, *child.shape, generator=generator).to(dtype)
-
-    return space.map(leaf) if isinstance(space, dict) else leaf(space)
 
 
 def test_key_that_modules_use_is_refused():
@@ -38,8 +24,8 @@ def test_key_that_modules_use_is_refused():
 
 
 def test_shapes_of_logits_and_actions():
-    intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
-    logits = nn.Sequential(intake, output)(random_obs(TREE, 6))
+    output = heads.output(MOVES, WIDTH)
+    logits = output(torch.randn(6, WIDTH))
     assert logits.movement.shape == (6, 2, 7) and logits.fire.shape == (6, 2, 2)
     torch.testing.assert_close(logits.movement.exp().sum(-1), torch.ones(6, 2))
     actions = output.sample(logits)
@@ -186,12 +172,10 @@ def duel(to_gpu, n_rows, width, n_agents, n_choices):
     """Returns an output whose values and advantages are large, and features."""
     torch.manual_seed(0)
     output = heads.output(spaces.MultiDiscrete(n_agents, n_choices), width, "duelling")
-    for name, leaf in [*output.named_parameters()]:
-        module, _, name = name.rpartition(".")
-        scale = width**-0.5 if module == "hidden" else 1.0
-        leaf = torch.nn.Parameter(to_gpu((scale * torch.randn(leaf.shape)).bfloat16().float()))
-        setattr(output.get_submodule(module), name, leaf)
-    return output, to_gpu(torch.randn(n_rows, width).bfloat16()).requires_grad_()
+    for name, leaf in output.named_parameters():
+        scale = width**-0.5 if name.startswith("hidden") else 1.0
+        leaf.data = (scale * torch.randn(leaf.shape)).bfloat16().float()
+    return moved(output, to_gpu), to_gpu(torch.randn(n_rows, width).bfloat16()).requires_grad_()
 
 
 @DUELS
