@@ -174,6 +174,18 @@ def test_residual_connection_around_core(name, layers, device, width):
             assert_close(output[0].float(), results[0][0][t], device)
 
 
+@pytest.mark.parametrize("name", ["lstm", "mingru"])
+def test_wrong_shapes_raise(name):
+    """Kernels would read beyond them."""
+    core, x, reset, state = case(name, layers=1)
+    with pytest.raises(ValueError, match=r"reset is \(9, 4\) on cpu, but x asks for \(9, 5\) on"):
+        core(x, reset[:, :4], state)
+    with pytest.raises(ValueError, match=r"state.output is \(1, 16\) on cpu, but .* \(5, 16\)"):
+        core(x, reset, arrdict(state, output=state.output[:1]))
+    with pytest.raises(ValueError, match=r"x is \(0, 5, 16\), but a sequence has at least one"):
+        core(x[:0], reset[:0], state)
+
+
 def test_gru_matches_torch():
     core, x, _, state = case("gru", layers=1)
     torch_gru = nn.GRU(W, W)

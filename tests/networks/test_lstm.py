@@ -80,14 +80,8 @@ def test_outputs_and_gradients_match_torch(p_reset, context):
         (*inputs, cell.weight_ih, cell.weight_hh, cell.bias_ih),
         materialize_grads=True,
     )
-    names = "x", "output", "cell", "input", "recurrent", "bias"
-    for name, grad, expected_grad in zip(names, grads, expected_grads, strict=True):
-        torch.testing.assert_close(
-            *(grad, expected_grad),
-            rtol=1e-4,
-            atol=1e-4,
-            msg=lambda text, name=name: f"d {name}: {text}",
-        )
+    names = "d x", "d output", "d cell", "d input", "d recurrent", "d bias"
+    assert_close(names, grads, expected_grads, 1e-5)
 
 
 def test_forget_gates_start_open():
@@ -100,18 +94,6 @@ def test_forget_gates_start_open():
     _, after = lstm(torch.zeros(1, B, W), torch.zeros(1, B, dtype=torch.bool), state)
     retained = torch.sigmoid(torch.tensor(1.0)).item()
     torch.testing.assert_close(after.cell, torch.full((B, W), retained), **CLOSE)
-
-
-def test_wrong_shapes_raise():
-    lstm, x, reset, state = case()
-    with pytest.raises(
-        ValueError, match=r"reset is \(9, 4\) on cpu, but x asks for \(9, 5\) on cpu"
-    ):
-        lstm(x, reset[:, :4], state)
-    with pytest.raises(
-        ValueError, match=r"state.cell is \(1, 16\) on cpu, but x asks for \(5, 16\)"
-    ):
-        lstm(x, reset, arrdict(state, cell=state.cell[:1]))
 
 
 def test_only_a_residual_layer_adds_its_input():
