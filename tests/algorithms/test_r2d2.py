@@ -11,6 +11,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import checkpoint
 from megastep.agents.storage.replay import ReplaySettings
 from megastep.arrdict import arrdict
+from tests.helpers.made_up import weights
 from tests.helpers.tiny import TINY, UPDATE
 
 B, T, WIDTH = 6, 8, 16
@@ -68,10 +69,6 @@ def make(device="cpu", width=WIDTH, seed=1, burn_in=3, **settings):
     settings = {**SETTINGS, "replay": replay, **settings}
     learner = r2d2.R2D2(policy.to(device), seed=seed, **settings)
     return learner, learner.collector(env)
-
-
-def weights(policy):
-    return torch.cat([p.detach().flatten() for p in policy.parameters()])
 
 
 def update(learner, collect, n):
