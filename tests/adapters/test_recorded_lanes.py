@@ -141,10 +141,8 @@ def kernels_on_cpu(env, cuda_on_cpu, monkeypatch):
 
     graphs_on_cpu.install(monkeypatch)
     monkeypatch.setattr(copies, "launch", launch)
-    pageable, empty = (
-        (lambda *sizes, pin_memory=False, **where: empty(*sizes, **where)),
-        torch.empty,
-    )
+    empty = torch.empty
+    pageable = lambda *sizes, pin_memory=False, **where: empty(*sizes, **where)  # noqa: E731
     monkeypatch.setattr(torch, "empty", pageable)
     for name, leaf in vars(env).items():
         if isinstance(leaf, torch.Tensor):

@@ -155,10 +155,8 @@ class Wage(Env):
         self.ends = ends
 
     def result(self, action):
-        ended, none = (
-            torch.rand(B, generator=self.generator) < 1 / 8,
-            torch.zeros(B, dtype=torch.bool),
-        )
+        ended = torch.rand(B, generator=self.generator) < 1 / 8
+        none = torch.zeros_like(ended)
         return torch.ones(B), *((ended, none) if self.ends == "terminal" else (none, ended))
 
 

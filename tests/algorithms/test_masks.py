@@ -11,10 +11,8 @@ from tests.helpers.learners import LEARNERS
 from tests.helpers.tiny import TINY
 
 B, N = 6, 5
-MOVES, TREE = (
-    spaces.MultiDiscrete(2, N),
-    dict(move=spaces.MultiDiscrete(2, N), turn=spaces.MultiContinuous(1, 2)),
-)
+MOVES = spaces.MultiDiscrete(2, N)
+TREE = dict(move=MOVES, turn=spaces.MultiContinuous(1, 2))
 
 
 class Forbidding:

@@ -253,10 +253,8 @@ def test_failed_saves_are_one_warning_also_where_the_run_folder_is_gone(tmp_path
 
 
 def test_losses_may_be_numbers_or_none_at_all(tmp_path):
-    run, losses = (
-        make_trainer(tmp_path, samples=2 * UPDATE),
-        iter([{"loss/a": 0.5, "loss/b": torch.tensor(2), "loss/c": 3}, {}]),
-    )
+    run = make_trainer(tmp_path, samples=2 * UPDATE)
+    losses = iter([{"loss/a": 0.5, "loss/b": torch.tensor(2), "loss/c": 3}, {}])
     run.learner.update = lambda rollout: next(losses)
     run.train()
     first, second = run.rows
