@@ -4,7 +4,7 @@ T steps of a rollout, B lanes, L steps of a sequence, M sequences of a minibatch
 valid steps: those that the environment took, of lanes that learn. An update never synchronises.
 """
 
-from typing import Annotated, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import torch
 from pydantic import Field
@@ -28,7 +28,7 @@ from megastep.coefficients import on_device
 from megastep.dotdict import mapping
 from megastep.kernels.build.launch import Blocks, launch
 from megastep.settings import MAX_ENVS, checked
-from megastep.types import Env, Tree, World
+from megastep.types import Env, Tree
 
 #: R2D2's default replay settings. A configuration that sets some of them keeps the others.
 REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
@@ -160,14 +160,8 @@ class EpsilonGreedy:
         self.policy, self.epsilon = policy, epsilon
         self.initial, self.compute_dtype = policy.initial, policy.compute_dtype
 
-    def __call__(
-        self,
-        world: World,
-        state: Tree,
-        sample: bool = True,
-        generator: torch.Generator | None = None,
-    ) -> tuple[arrdict, arrdict]:
-        decision, state = self.policy(world, state, sample, generator, epsilon=self.epsilon)
+    def __call__(self, *arguments: Any, **options: Any) -> tuple[arrdict, arrdict]:
+        decision, state = self.policy(*arguments, **options, epsilon=self.epsilon)
         return arrdict(actions=decision.actions), state
 
 
