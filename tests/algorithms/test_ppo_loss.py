@@ -1,11 +1,10 @@
-"""PPO's fused loss and GAE on a GPU against their plain forms."""
+"""PPO's fused losses on a GPU against their plain forms."""
 
 import pytest
 import torch
 
 from megastep import spaces
 from megastep.agents.algorithms import ppo as ppo_module
-from megastep.agents.algorithms import returns
 from megastep.agents.algorithms.ppo import PPO, ppo_loss
 from megastep.agents.networks import heads, linear
 from megastep.agents.networks.critic import ValueOutput
@@ -70,38 +69,6 @@ def test_without_valid_steps_nothing_is_learned(to_gpu):
     loss, metrics = loss_of(leaves, batch, scale, settings)
     assert not loss and not any(metrics.values())
     assert not any(gradient.any() for gradient in torch.autograd.grad(loss, leaves))
-
-
-@pytest.mark.parametrize("n_steps, n_lanes", [(1, 1), (32, 1000), (5, 64)])
-def test_gae_on_a_gpu_matches_the_cpu(n_steps, n_lanes, to_gpu):
-    torch.manual_seed(0)
-    value, reward = torch.randn(2, n_steps, n_lanes)
-    flags = [torch.rand(n_steps, n_lanes) < 0.2 for _ in range(4)]  # the last: learns
-    inputs = [reward, value, torch.randn(n_lanes), *flags]
-    plain = returns.gae(*inputs, gamma=0.9, lambda_=0.8)
-    fused = returns.gae(*map(to_gpu, inputs), gamma=0.9, lambda_=0.8)
-    for name, leaf in plain.items():
-        torch.testing.assert_close(fused[name].cpu(), leaf, rtol=1e-5, atol=1e-5)
-
-
-def transposed(leaf):
-    """Returns an equal tensor with another memory layout."""
-    return leaf.T.contiguous().T if leaf.dim() else leaf
-
-
-@pytest.mark.parametrize("change", [transposed, torch.Tensor.double])
-def test_gae_on_a_gpu_takes_other_layouts_and_float64(change, to_gpu):
-    torch.manual_seed(0)
-    value, reward = torch.randn(2, 7, 5)
-    last_value, flags = torch.randn(5), [torch.rand(7, 5) < 0.2 for _ in range(3)]
-    plain = returns.gae(reward, value, last_value, *flags, gamma=0.9, lambda_=0.8)
-    inputs = [change(to_gpu(reward)), change(to_gpu(value)), to_gpu(last_value)]
-    inputs += [transposed(to_gpu(flag)) for flag in flags]
-    other = returns.gae(*inputs, gamma=0.9, lambda_=0.8)
-    for name, leaf in plain.items():
-        torch.testing.assert_close(
-            other[name].cpu().to(leaf.dtype), leaf, rtol=1e-5, atol=1e-5, check_stride=False
-        )
 
 
 def rounded(x):

@@ -208,15 +208,27 @@ def test_inverse_rescale_in_float32():
     torch.testing.assert_close(returns.inverse_rescale(y), x, rtol=1e-6, atol=1e-6)
 
 
+def transposed(leaf):
+    """Returns an equal tensor with another memory layout."""
+    return leaf.T.contiguous().T if leaf.dim() == 2 else leaf
+
+
+@pytest.mark.parametrize("change", [torch.clone, transposed, torch.Tensor.double])
 @pytest.mark.parametrize("n_steps, n_lanes", [(1, 1), (32, 1000)])
-def test_vtrace_on_a_gpu_matches_the_cpu(n_steps, n_lanes, to_gpu):
-    generator = torch.Generator().manual_seed(0)
-    log_ratio, reward, value = torch.randn(3, n_steps, n_lanes, generator=generator)
-    reset, terminal, truncated = torch.rand(3, n_steps, n_lanes, generator=generator) < 0.1
-    last_value = torch.randn(n_lanes, generator=generator)
-    inputs = log_ratio, reward, value, last_value, reset, terminal, truncated & ~terminal
-    settings = dict(gamma=0.95, lambda_=0.9, rho_clip=1.2, c_clip=0.9)
-    plain = returns.vtrace(*inputs, **settings)
-    fused = returns.vtrace(*map(to_gpu, inputs), **settings)
-    for name, leaf in plain.items():
-        torch.testing.assert_close(fused[name].cpu(), leaf, rtol=1e-5, atol=1e-5)
+def test_a_gpu_computes_the_same_of_any_layout_and_dtype(n_steps, n_lanes, change, to_gpu):
+    torch.manual_seed(0)
+    log_ratio, reward, value = torch.randn(3, n_steps, n_lanes)
+    reset, terminal, truncated, learns = torch.rand(4, n_steps, n_lanes) < 0.1
+    inputs = reward, value, torch.randn(n_lanes), reset, terminal, truncated & ~terminal
+    settings = dict(gamma=0.95, lambda_=0.9)
+    clips = dict(rho_clip=1.2, c_clip=0.9, **settings)
+    for function, arguments, numbers in (
+        (returns.gae, (*inputs, ~learns), settings),
+        (returns.vtrace, (log_ratio, *inputs), clips),
+    ):
+        there = [to_gpu(x) for x in arguments]
+        there = [change(x) if x.is_floating_point() else transposed(x) for x in there]
+        fused = function(*there, **numbers)
+        for name, leaf in function(*arguments, **numbers).items():
+            other = fused[name].cpu().to(leaf.dtype)
+            torch.testing.assert_close(other, leaf, rtol=1e-5, atol=1e-5, check_stride=False)
