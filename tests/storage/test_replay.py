@@ -186,20 +186,6 @@ def test_nonfinite_rollouts_are_never_drawn():
         compare(replay, lists)
 
 
-@pytest.mark.parametrize("length", [4, 6])
-def test_unwritten_rows_are_never_drawn(length):
-    world, poison = World(4, privileged=False), -77
-    replay = buffer_of(world, 5, length=length)
-    for rows in [*leaves(replay.rows), *leaves(replay.state)]:
-        rows.fill_(poison if rows.dtype != torch.uint8 else 177)
-    lists = Lists(5, 4, length)
-    for _ in range(7):
-        rollout = world.next()
-        replay.add(rollout)
-        lists.add(rollout)
-        compare(replay, lists)
-
-
 def test_priorities_and_importance_weights(device):
     world = World(4, device)
     replay = buffer_of(world, 3, length=4, alpha=0.5, beta=1.0)
