@@ -246,21 +246,16 @@ CPU_SLACK = 2e-5
 def on_cpu(form, n_steps, n_lanes, width):
     """Returns outputs, last cell and all gradients by the CPU's kernel, or by PyTorch."""
     torch.manual_seed(0)
-    inputs = [
-        torch.randn(width, n_steps, n_lanes).permute(1, 2, 0),  # not contiguous
-        torch.randn(4 * width, width) / width**0.5,
-        torch.randn(4 * width),
-        torch.randn(4 * width, width) / width**0.5,
-        torch.randn(n_lanes, width),
-        torch.randn(n_lanes, width),
-    ]
-    inputs = [leaf.requires_grad_() for leaf in inputs]
-    reset = (torch.rand(n_lanes, n_steps) < 0.3).T
-    d_results = torch.randn(n_steps, n_lanes, width), torch.randn(n_lanes, width)
-    with plain_operations():
-        outputs, _, cell = form(*inputs[:4], reset, *inputs[4:], False)
-    results = outputs, cell
-    return [*results, *torch.autograd.grad(results, inputs, d_results)]
+    weights, recurrent = torch.randn(2, 4 * width, width) / width**0.5
+    inputs = dict(
+        x=torch.randn(width, n_steps, n_lanes).permute(1, 2, 0),  # not contiguous
+        reset=(torch.rand(n_lanes, n_steps) < 0.3).T,
+        state=torch.randn(2, n_lanes, width),
+        weights=(weights, torch.randn(4 * width), recurrent),
+        d_outputs=torch.randn(n_steps, n_lanes, width),
+        d_cell=torch.randn(n_lanes, width),
+    )
+    return sequence(form, "cpu", torch.float32, **inputs)
 
 
 @pytest.mark.parametrize(
