@@ -12,6 +12,7 @@ from megastep.agents.networks import convolutions as kernels
 from megastep.agents.networks import fused, heads
 from megastep.agents.networks.linear import ComputeDtype
 from megastep.arrdict import arrdict
+from tests.networks.test_conv_backward import plain as gradients
 
 BF16 = torch.bfloat16
 # Both round hidden activations and features to 8 bits. The order of float32 sums decides a few
@@ -40,15 +41,6 @@ def convolve(rows, first_weight, first_bias, second_weight, second_bias, feature
         sums = functional.conv1d(rows.float(), weight.float(), bias.float(), stride, stride)
         rows = sums.relu().to(BF16)
     return rows.flatten(1) if features is None else features.copy_(rows.flatten(1))
-
-
-def gradients(d_features, features, rows, first_weight, first_bias, second_weight):
-    """The twin of `kernels.conv_backward`."""
-    leaves = [leaf.float() for leaf in (first_weight, first_bias, second_weight, first_bias)]
-    first_weight, first_bias, second_weight, second_bias = (x.requires_grad_() for x in leaves)
-    hidden = functional.conv1d(rows.float(), first_weight, first_bias, 4, 4).relu()
-    outputs = functional.conv1d(hidden, second_weight, second_bias, 2, 2).flatten(1)
-    return torch.autograd.grad(outputs, leaves, d_features.float() * (features > 0))
 
 
 IMAGE, VECTOR = spaces.MultiImage(1, 3, 1, 16), spaces.MultiVector(1, 3)
