@@ -13,7 +13,6 @@ from megastep.agents.algorithms.nonfinite import (
     NonFiniteValue,
     nonfinite_leaf,
 )
-from tests.helpers.synchronisation import no_synchronisation
 
 T, B = 4, 3
 
@@ -165,16 +164,3 @@ def test_infinities_of_both_signs_are_found(to_gpu):
     assert not check(rollout)
     value = check.read(rollout)[0]
     assert (value.name, value.lane, value.step) == ("rgb", 1, 2) and math.isnan(value.size)
-
-
-@pytest.mark.cuda
-def test_check_never_synchronises():
-    rollout = {name: values.cuda() for name, values in floats().items()}
-    rollout["obs.imu"][3, 1] = torch.nan
-    check = NonFiniteCheck(torch.device("cuda"))
-    check(rollout)
-    with no_synchronisation():
-        is_finite = check(rollout)
-        check.count(~is_finite)
-    bad, n_skipped = check.read(rollout)
-    assert (bad.name, bad.lane, bad.step, n_skipped) == ("obs.imu", 1, 3, 1)
