@@ -96,11 +96,11 @@ class Lists:
         first = j * self.n_steps
         for name, rows in self.rows.items():
             length = self.length + (name in WITH_LAST)
-            for path in paths(rows[0]):
-                expected = [leaf_of(row, path)[lane] for row in rows[first : first + length]]
-                yield name, path, torch.stack(expected)
-        for path in paths(self.states[j]):
-            yield "state", path, leaf_of(self.states[j], path)[lane]
+            parts = [*map(spaces.leaves, rows[first : first + length])]
+            for path in parts[0]:
+                yield name, path, torch.stack([part[path][lane] for part in parts])
+        for path, leaf in spaces.leaves(self.states[j]).items():
+            yield "state", path, leaf[lane]
 
 
 def fields(rollout):
@@ -109,18 +109,6 @@ def fields(rollout):
     if rollout.privileged is not None:
         trees["privileged"] = arrdict(privileged=rollout.privileged)
     return trees
-
-
-def paths(tree, path=()):
-    if not isinstance(tree, dict):
-        return [path]
-    return [leaf for key in tree for leaf in paths(tree[key], (*path, key))]
-
-
-def leaf_of(tree, path):
-    for key in path:
-        tree = tree[key]
-    return tree
 
 
 def buffer_of(world, n_rollouts, length, **settings):
@@ -142,14 +130,14 @@ def compare(replay, lists, n=20):
     if not drawable:
         return set()
     batch = replay.sample(n, torch.Generator(replay.n_added.device).manual_seed(n))
-    drawn = set()
+    drawn, parts = set(), spaces.leaves(batch)
     for m in range(n):
         slot, lane = divmod(batch.index[m].item(), B)
         j = len(lists.is_finite) - 1 - batch.age[m].item()
         assert j % replay.n_rollouts == slot and j in lists.drawable()
         drawn.add((j, lane))
         for name, path, expected in lists.sequence(j, lane):
-            leaf = leaf_of(batch, path)
+            leaf = parts[path]
             leaf = (leaf[m] if name == "state" else leaf[:, m]).cpu()
             close = dict(rtol=2**-11, atol=0) if name == "state" else dict(rtol=0, atol=0)  # fp16
             testing.assert_close(leaf, expected.cpu(), msg=f"{path} of {j, lane}", **close)
@@ -322,11 +310,10 @@ def test_kernels_match_pytorch(n_steps, length, n, to_gpu):
     expected = plain._read(batch.index.cpu(), batch.probability.cpu())
     assert plain.tree.priorities[batch.index.cpu()].all()
     testing.assert_close(batch.pop("weight").cpu(), expected.pop("weight"), rtol=1e-6, atol=0)
-    for name, path, leaf in (
-        (name, path, leaf_of(tree, path)) for name, tree in expected.items() for path in paths(tree)
-    ):
-        ours = leaf_of(batch[name], path).cpu()
-        assert ours.dtype == leaf.dtype and torch.equal(ours, leaf), f"{name} {path}"
+    parts = spaces.leaves(batch)
+    for path, leaf in spaces.leaves(expected).items():
+        ours = parts[path].cpu()
+        assert ours.dtype == leaf.dtype and torch.equal(ours, leaf), path
 
     errors = torch.rand(len(first), generator=world.generator)
     errors[1::4], errors[2::8], errors[3::9] = torch.nan, torch.inf, 0.0
