@@ -12,15 +12,7 @@ from megastep import engine
 from megastep.agents.networks import linear
 from megastep.agents.networks.fused import aligned_rows
 from megastep.agents.networks.linear import ComputeDtype, cast, cast_joined, rounded
-
-BF16 = dict(rtol=0, atol=2e-2)  # times the largest number: 8 bits, and sums of them
-
-
-def assert_close(fused, plain, **tolerance):
-    scale = plain.abs().max().item() or 1.0
-    tolerance = {**BF16, **tolerance}
-    tolerance["atol"] *= scale
-    torch.testing.assert_close(fused.float().cpu(), plain.float().cpu(), **tolerance)
+from tests.networks.test_intakes import assert_close
 
 
 def test_weights_are_cast_once_per_context():
