@@ -1,26 +1,17 @@
-"""The contract of learners, and the base classes of the built-in ones.
+"""The base classes of the built-in learners, and the rules of all.
 
 A learner is the class behind `learner=module:Class`. It does not have to inherit from anything: it
-needs the attributes of `megastep.agents.types.Learner`, and is used like this:
-
-    learner = Class(policy, seed=1, **settings)  # settings: its other constructor arguments
-    collect = learner.collector(env)
-    while training:
-        rollout = collect()                      # T steps of B lanes
-        losses = learner.update(rollout)         # scalar tensors by name
+needs the attributes of `megastep.agents.types.Learner`; docs/learners.md has an example, and a
+table of what is optional.
 
 - `collect()` returns a `megastep.agents.types.RolloutLike`, which may be the same object every
-  time. `collect.rollout` exists before the first call, too. Neither it nor `update()` synchronises.
-- A learner with a `check`, a `nonfinite.NonFiniteCheck`, passes `rollout.floats()` to it in every
-  `update()` and skips a rollout with non-finite numbers. The trainer stops after many skipped
-  updates in a row. Without a check, a run stops before it saves weights that are not finite.
+  time. Neither it nor `update()` synchronises.
+- A `check` gets `rollout.floats()` in every `update()`, which skips a rollout with non-finite
+  numbers. The trainer stops after many skipped updates in a row.
 - Only transitions with `rollout.learns` and without `rollout.reset` count in a loss. An environment
   with opponents has an attribute `learners`, a bool per lane; only those lanes need to be stored.
 - `collector(env)` resets the environment before it returns: a run then gives the lanes random ages.
-- The constructor's arguments `seed` and `graph` are optional. `seed` receives the run's seed, which
-  `generator.stream_seed(seed, name)` turns into that of a random stream of its own; `graph` is true
-  if updates should be captured as a CUDA graph.
-- `megastep.agents.types.LearnerOptions` and `CollectorOptions` list what else is optional.
+- `generator.stream_seed(seed, name)` makes the seed of each random stream of the run's.
 
 Building blocks for your own learner: `GradientLearner`, `storage.rollout.make_rollout`,
 `storage.collector.Collector`, `gradient_steps.GradientSteps`, `cuda_graph.CudaGraphUpdate`,
