@@ -1,11 +1,5 @@
-"""Objects that training calls at certain moments: its own parts, and those of users.
-
-    class Stop:
-        def on_report(self, trainer, metrics):
-            if metrics.get("episode/return", 0) > 50:
-                trainer.end()
-
-`train.py callbacks=[my_module:Stop]`, or `megastep.train(callbacks=[Stop])`.
+"""Objects that training calls at certain moments: its own parts, and those of users, of which
+docs/callbacks.md has examples.
 """
 
 from __future__ import annotations
