@@ -89,13 +89,6 @@ class SFL:
             for name in dict.fromkeys(sources)
         }
 
-    def probabilities(self) -> torch.Tensor:
-        """Returns how likely each home is to be drawn, (D,) float32 of sum 1."""
-        powers = self.scores ** (1 / self.temperature)
-        total = powers.sum()
-        by_score = torch.where(total > 0, powers / total, 1 / len(powers))
-        return self.uniform / len(powers) + (1 - self.uniform) * by_score
-
     @torch.no_grad()
     def update(self, rollout: Rollout) -> None:
         """Learns from the episodes that ended in a rollout, and changes the probabilities."""
@@ -115,7 +108,11 @@ class SFL:
         self.scores.copy_(torch.where(self.n_episodes > 0, variance, _UNSEEN))
         self.n_updates += 1
         if self.n_updates % self.every == 0:
-            weights = (self.probabilities() * _TOTAL).long()
+            powers = self.scores ** (1 / self.temperature)
+            total = powers.sum()
+            by_score = torch.where(total > 0, powers / total, 1 / len(powers))
+            probabilities = self.uniform / len(powers) + (1 - self.uniform) * by_score
+            weights = (probabilities * _TOTAL).long()
             self.cumulative.copy_(weights.cumsum(0).clamp_(max=2**31 - 1))
 
     def _sums(self, homes, values) -> torch.Tensor:
