@@ -139,7 +139,7 @@ class GradientSteps:
         self.check = NonFiniteCheck(device)
         one(self.lr.device)
         # of the update in progress; totals are those of metrics, then steps taken and skipped
-        self.is_finite: torch.Tensor | None = None
+        self.is_finite: torch.Tensor
         self.totals: torch.Tensor | None = None
         self.metrics: dict[str, torch.Tensor] = {}
 
@@ -151,7 +151,6 @@ class GradientSteps:
         lower, higher = (self.lr / 1.5).clamp(min=least), (self.lr * 1.5).clamp(max=most)
         lr = torch.where((kl < desired / 2) & (kl > 0), higher, self.lr)
         lr = torch.where(kl > 2 * desired, lower, lr)
-        assert self.is_finite is not None
         self.lr.copy_(torch.where(self.is_finite, lr, self.lr))
 
     def begin(
@@ -185,7 +184,6 @@ class GradientSteps:
         """Takes one step down the gradient, and returns whether it did, () bool: only with valid
         transitions, and if enabled, () bool; else it is not counted as skipped.
         """
-        assert self.is_finite is not None
         grad_norm = self.optimizer.grad_norm()
         is_finite = grad_norm.isfinite() & self.is_finite
         is_taken = is_finite & is_enabled & (self.n_valid > 0)
