@@ -22,8 +22,6 @@ from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env
 
 _PARTS = "obs", "starts", "actions", "mask"
-# Names that an `extra_loss` cannot have.
-_METRICS = "policy", "value", "entropy"
 
 
 class BC(learner.GradientLearner):
@@ -121,6 +119,6 @@ class BC(learner.GradientLearner):
                 metrics["value"] = masked_mean(error.square(), valid)
                 loss = loss + self.coefficients["value_coef"] * metrics["value"]
             if self.has_extra_loss:
-                extra, own = self.extra_terms(now.features, batch, _METRICS)
+                extra, own = self.extra_terms(now.features, batch, metrics)
                 loss, metrics = loss + extra, metrics | own
         return loss, metrics, now.state
