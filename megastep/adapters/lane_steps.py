@@ -92,12 +92,12 @@ def _unflattened(tree, rest) -> Tree:
     return {key: _unflattened(value, rest) for key, value in tree.items()}
 
 
-#: The last made of each environment, by the environment's id.
+#: The last that began to reset or step each environment, by the environment's id.
 _LATEST: "weakref.WeakValueDictionary[int, Lanes]" = weakref.WeakValueDictionary()
 
 
 class Lanes:
-    """Steps an environment, until others are made of it. On a GPU steps are CUDA graphs, and worlds
+    """Steps an environment, until others begin to. On a GPU steps are CUDA graphs, and worlds
     are valid until the next step or reset.
 
     Args:
@@ -131,14 +131,15 @@ class Lanes:
         if purpose:
             self._require_masks(purpose)
         self._is_replaced = False
-        if older := _LATEST.get(id(env)):
-            older._is_replaced = True  # both would write into one last world
-        _LATEST[id(env)] = self
 
     def _require_own(self) -> None:
         if self._is_replaced:
             text = "was given to another adapter since; make an environment for each"
             raise ValueError(f"this {type(self.env).__name__} {text}")
+        if (older := _LATEST.get(id(self.env))) is not self:
+            if older:
+                older._is_replaced = True  # both would write into one last world
+            _LATEST[id(self.env)] = self
 
     def _require_masks(self, purpose) -> None:
         if not self._takes_masks:

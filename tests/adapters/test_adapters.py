@@ -141,13 +141,23 @@ def test_lanes_with_equal_seeds_differ_and_repeat():
 
 def test_an_environment_has_one_adapter_the_last():
     room = pong()
-    first, second = adapters.VectorEnv(room, to_numpy=False), adapters.VectorEnv(room)
+    first = adapters.VectorEnv(room, to_numpy=False)
+    first.reset()
+    for make in (
+        lambda: adapters.VectorEnv(room, dtype=torch.float64),
+        lambda: adapters.VectorEnv(room, render_mode="human"),
+        lambda: adapters.SingleEnv(room),
+    ):
+        with pytest.raises(ValueError, match="must be|has one lane"):
+            make()
+        first.step(first.action_space.sample())  # an adapter that could not be made leaves it
+    second = adapters.VectorEnv(room)
+    second.reset()
     for call in (first.reset, lambda: first.step(first.action_space.sample())):
         with pytest.raises(ValueError, match="this Pong was given to another adapter since"):
             call()
-    second.reset()
     copied = copy.deepcopy(second)
-    adapters.VectorEnv(room)
+    adapters.VectorEnv(room).reset()
     copied.step(copied.action_space.sample())
 
 
