@@ -199,12 +199,17 @@ class Lanes:
         return mask.to(self.device)
 
     def _decision(self, actions) -> arrdict:
-        """Returns the decision of actions (B, ...) of any number type."""
+        """Returns the decision of actions (B, ...): discrete ones of any integer type or bool."""
 
         def converted(space, values) -> torch.Tensor:
-            dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
+            is_discrete = isinstance(space, spaces.MultiDiscrete)
+            dtype = torch.int64 if is_discrete else torch.float32
             may_follow = self._source.type == "cuda"  # the CPU reads what is there
-            values = torch.as_tensor(values).to(self._source, dtype, non_blocking=may_follow)
+            values = torch.as_tensor(values)
+            if is_discrete and not torch.can_cast(values.dtype, dtype):
+                text = f"actions must be integers from 0 to {space.n_actions - 1}, but their dtype"
+                raise ValueError(f"{text} is {values.dtype}; convert them to int64")
+            values = values.to(self._source, dtype, non_blocking=may_follow)
             shape = self.n_lanes, *space.shape
             if values.numel() != math.prod(shape):
                 raise ValueError(f"actions must fit {shape}, but their shape is {(*values.shape,)}")

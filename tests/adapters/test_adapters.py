@@ -203,6 +203,32 @@ def test_what_does_not_fit_is_named_in_gymnasium():
     assert len(adapters.VectorEnv(pong(2), render_mode="rgb_array").render()) == 2
 
 
+INTEGERS = "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64".split()
+
+
+def test_discrete_actions_are_of_any_integer_dtype_and_no_other():
+    env = adapters.VectorEnv(pong())
+    choices = [1, 0, 1, 1]
+    given = [np.array(choices, name) for name in INTEGERS]
+    given += [torch.tensor(choices, dtype=getattr(torch, name)) for name in INTEGERS]
+    given += [choices, [*map(bool, choices)], [*np.array(choices)], np.array(choices)[:, None]]
+    shown = []
+    for actions in given:
+        env.reset(seed=1)
+        shown.append(env.step(actions)[0])
+    assert all(np.array_equal(shown[0], obs) for obs in shown)
+    floats = [[0.7] * 4, np.full(4, 0.7), torch.ones(4).half(), torch.ones(4).cfloat()]
+    for actions, name in zip(floats, ("float32", "float64", "float16", "complex64"), strict=True):
+        text = f"actions must be integers from 0 to 2, but their dtype is torch.{name}; convert"
+        with pytest.raises(ValueError, match=text):
+            env.step(actions)
+    with pytest.raises(ValueError, match="but their dtype is torch.float64"):
+        gymnasium.make("megastep/Pong-v0").unwrapped.step(0.7)
+    driven = adapters.VectorEnv(pointgoal(control="continuous"))
+    driven.reset()
+    driven.step(np.zeros((4, 3), int))
+
+
 def test_an_extra_that_is_missing_is_named(monkeypatch):
     with pytest.raises(AttributeError, match="megastep.adapters has no Vec; it has SingleEnv"):
         _ = adapters.Vec
