@@ -73,6 +73,10 @@ def prepare(tree: Tree, typed: list[str]) -> Tree:
         raise ConfigErrors([(given[1], f"cannot be combined with {given[0]}")])
     if not given:
         return tree
+    if given[0] == "resume" and tree.get("member") is not None:
+        one = folders.quoted("resume", Path(with_member(tree, "resume")["resume"]))
+        cure = f"{one} continues that member alone, and without member= all continue"
+        raise ConfigErrors([("member", f"is for init= and rerun=; {cure}")])
     how, allowed = given[0], {"resume": RESUMABLE, "rerun": REPEATABLE}.get(given[0], typed)
     path = folders.find(tree[how], "best" if how == "init" else None)
     whole = folders.is_population(path)

@@ -210,6 +210,12 @@ def test_population_without_scores_copies_nobody_and_names_no_best(here, capsys)
     assert len(rows) == 9 and all(row["from"] == row["member"] for row in rows)
     assert entry.run_command("evaluate", ["run=P", "device=cpu"]) == 2
     assert "choose one with member=, 0 to 2" in capsys.readouterr().err
+    for words, text in (
+        (["member=1"], "member: is for init= and rerun=; resume=P/member-1 continues that member"),
+        (["member=7"], "P has no member 7; its members are 0 to 2"),
+    ):
+        assert text in refused(capsys, "resume=P", *words, "more_samples=64")
+    assert "P/member-1 is a single run" in refused(capsys, "resume=P/member-1", "member=1")
 
 
 def test_full_disk_is_a_warning_and_loses_no_generation(here, monkeypatch, capsys):
