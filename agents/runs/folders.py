@@ -26,8 +26,9 @@ RUNS, SWEEPS = Path("runs"), Path("sweeps")
 STARTED = RUNS / "started.txt"
 #: The run folder of a population's first member, `populations.folder_of(root, 0)`.
 MEMBER = "member-0"
-#: Prefix of error messages.
+#: Prefixes of error messages.
 CANNOT = "{} cannot be written; choose another with folder=: "
+RESUMES_NOT = "{} cannot be written, so its run cannot go on; resume a copy of the folder: "
 
 
 # ---- New folders ----
@@ -92,7 +93,8 @@ def locked(folder: Path) -> Iterator[None]:
             f"kill {pid}"
         ) from None
     except OSError as error:
-        with user_errors(CANNOT.format(folder)):
+        is_begun = is_population(folder) or (folder / "checkpoints").exists()
+        with user_errors((RESUMES_NOT if is_begun else CANNOT).format(folder)):
             if error.errno not in (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK):
                 raise
         text = f"{folder} is on a file system without locks; train in it only once at a time"

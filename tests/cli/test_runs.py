@@ -147,3 +147,20 @@ def test_file_system_without_locks(here, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", flock)
     with pytest.warns(match="file system without locks"), locked(here):
         pass
+
+
+@pytest.mark.parametrize(
+    "begun, cure",
+    [
+        ("", "choose another with folder=: "),
+        *((x, "resume a copy") for x in ("checkpoints", "member-0")),
+    ],
+)
+def test_read_only_folder_names_what_helps(here, monkeypatch, begun, cure):
+    def acquire(lock):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), lock.lock_file)
+
+    (here / begun).mkdir(exist_ok=True)
+    monkeypatch.setattr("filelock.FileLock.acquire", acquire)
+    with pytest.raises(UserError, match=f"cannot be written.*{cure}.*Read-only"), locked(here):
+        pass
