@@ -1,5 +1,6 @@
 """A profile of a few updates of a run: a trace, and a table of where the time went."""
 
+import contextlib
 import os
 import warnings
 from pathlib import Path
@@ -28,7 +29,7 @@ class Profiler:
 
     def __init__(self, folder: Path, n_updates: int, device: torch.device):
         self.folder, self.n_updates, self.device = folder, n_updates, device
-        self.n_begun, self._range, self._profile = 0, None, None
+        self.n_begun, self._range, self._profile = 0, contextlib.ExitStack(), None
         os.environ.setdefault("KINETO_LOG_LEVEL", "6")  # it prints a line at each start and stop
 
     def on_collect(self, trainer: object) -> None:
@@ -59,12 +60,9 @@ class Profiler:
         self._profile = None
 
     def _begin(self, phase) -> None:
-        if self._range is not None:
-            self._range.__exit__(None, None, None)
-        self._range = None
+        self._range.close()
         if self._profile is not None and phase is not None:
-            self._range = torch.profiler.record_function(phase)
-            self._range.__enter__()
+            self._range.enter_context(torch.profiler.record_function(phase))
 
     def _write(self) -> None:
         assert self._profile is not None
