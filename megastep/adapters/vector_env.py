@@ -202,8 +202,6 @@ class SingleEnv(gymnasium.Env):
     None or ``rgb_array``.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
-
     def __init__(self, env: Env, render_mode: str | None = None):
         self.vector = VectorEnv(env, AutoresetMode.NEXT_STEP, render_mode=render_mode)
         if self.vector.num_envs != 1:
@@ -214,7 +212,7 @@ class SingleEnv(gymnasium.Env):
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": optional(env, "fps")}
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": optional(env, "fps")}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Tree] | None = None
