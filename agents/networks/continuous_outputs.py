@@ -70,9 +70,8 @@ class GaussianOutput(_BoundedOutput):
         super().__init__(space, width, n_parameters=1)
         self.log_std = nn.Parameter(torch.zeros(self.shape))
         nodes, areas = np.polynomial.hermite_e.hermegauss(_N_NODES)
-        self.register_buffer("nodes", torch.tensor(nodes, dtype=torch.float32), persistent=False)
-        weights = torch.tensor(areas / areas.sum(), dtype=torch.float32)
-        self.register_buffer("weights", weights, persistent=False)
+        for name, numbers in dict(nodes=nodes, weights=areas / areas.sum()).items():
+            self.register_buffer(name, torch.tensor(numbers).float(), persistent=False)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         mean = self.max_mean * (self._linear(x) / self.max_mean).tanh()
