@@ -31,8 +31,8 @@ GROUPS = (32, 16, 8)
 UNSPILLED_BLOCKS = 18
 APART = 0.05  # metres
 MAX_SPAWN_WARPS = 1 << 15  # that look whether agents respawn where there are objects
-#: Of baked light in the cache: the beginning of files' names, their number, and the fewest layouts.
-PREFIX, MAX_FILES, MIN_CACHED = "baked-light-", 16, 32
+#: Of baked light in the cache: how names of files begin, most files and bytes, fewest layouts.
+PREFIX, MAX_FILES, MAX_BYTES, MIN_CACHED = "baked-light-", 256, 512e6, 32
 MAX_SLOTS = ENGINE.constants["MAX_SLOTS"]  # agents and movable objects of an environment
 BODIES_BYTES, SLOT_BYTES = (ENGINE.constants[name] for name in ("BODIES_BYTES", "SLOT_BYTES"))
 
@@ -66,7 +66,7 @@ def bake_cached(scenery: Scenery) -> None:
     of_lights = layouts.lights.vals, layouts.light_starts
     tensors = layouts.lines.vals, layouts.wall_starts, layouts.texel_starts, *of_lights
     parts = ENGINE.sources(".h", ".cpp"), *(tensor.numpy() for tensor in tensors)
-    light = cache.arrays(PREFIX, parts, build, MAX_FILES)["light"]
+    light = cache.arrays(PREFIX, parts, build, MAX_FILES, MAX_BYTES)["light"]
     layouts.baked.vals.copy_(torch.from_numpy(light))
     return None
 

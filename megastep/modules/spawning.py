@@ -20,7 +20,7 @@ from megastep.modules.lifecycle import CounterGenerator, derived_seed
 T = TypeVar("T")
 CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other spawned agents
 PREFIX = "spawn-points-"  # of the files in the cache
-MAX_FILES = 64  # of each kind in the cache, about a megabyte each for 512 layouts
+MAX_FILES = 256  # of each kind in the cache: two or more for each member of a population
 MIN_CACHED = 32  # layouts; the search is quick for fewer
 MAX_SPAWNS = 1_000_000  # points per layout; four times as many are drawn at once
 BATCHES = 20  # of candidate points; then the search ends

@@ -14,7 +14,7 @@ FOV = 122.0  # degrees; neighbouring cameras overlap by two
 RES = 512  # rays per camera
 AWAY = 1e4  # metres; where unused agents stand
 PREFIX = "visible-texels-"  # of the files in the cache
-MAX_FILES = 32  # in the cache, half a kilobyte per layout
+MAX_FILES = 256  # in the cache, half a kilobyte per layout: one for each member of a population
 MIN_CACHED = 32  # layouts; the computation is quick for fewer
 TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
 

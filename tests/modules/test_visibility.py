@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from megastep import core, engine, modules, scene, toys
+from megastep import cache, core, engine, envs, modules, scene, toys
+from megastep.engine import operations
 from megastep.geometries import sample
-from megastep.modules import visibility
+from megastep.modules import spawning, visibility
 from tests.helpers.texels import n_texels, seen_of, unpacked
 
 
@@ -90,3 +91,19 @@ def test_visible_texels_of_many_homes_are_cached(folder, monkeypatch):
     modules.visible_texels(c.scenery, points)
     assert len(looks) == 2, "for other points, and for walls that moved"
     assert not torch.equal(other, first)
+
+
+def test_a_second_start_of_many_members_computes_nothing_again(folder, monkeypatch):
+    """Each member of a population has light, spawn points and visible texels of its own seed."""
+    for module in (operations, spawning, visibility):
+        monkeypatch.setattr(module, "MIN_CACHED", 1)
+
+    def start(seeds):
+        for seed in seeds:
+            envs.Explorer(1, [toys.box()], seed=seed, device="cpu")
+
+    start(range(64))
+    start([64])  # another run
+    assert len(list(folder.glob("spawn-points-*"))) == 65
+    monkeypatch.setattr(cache, "write_atomically", None)  # whatever is computed would be written
+    start(range(65))
