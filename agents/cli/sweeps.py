@@ -35,9 +35,11 @@ from megastep.agents.errors import ConfigErrors, UserError, shortened, user_erro
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, signals
 from megastep.agents.launch.again import AUTO
+from megastep.agents.reports import runs
 from megastep.agents.runs import folders, scores
 from megastep.agents.types import Row
 from megastep.atomic_files import write_atomically
+from megastep.settings import closest
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
 #: What the score of a job is, unless `metric=` says otherwise.
@@ -161,11 +163,12 @@ def sweep(composer: Composer, words: list[str]) -> int:
                 folders.SWEEPS.rmdir()
     if not rows:
         raise UserError(f"The sweep cannot start: {problem}")
-    scored = [row["score"] for row in rows if row["state"] == DONE and "score" in row]
-    if scored and all(score is None for score in scored):
+    scored = [row for row in rows if row["state"] == DONE and "score" in row]
+    if scored and all(row["score"] is None for row in scored):
         cause = "no episode finished; train longer"
         if metric != EARNED:
-            cause = f"none has {metric}; type finish.evaluate=true, or another metric="
+            cure = job.cure(Path(scored[0]["folder"])) if trainings else "name another metric="
+            cause = f"none has {metric}; {cure}"
         console.say(f"No job has a score, so none is the best, as {cause}", sys.stderr)
     elif problem and all(row["state"] in (DONE, LOST) for row in rows):
         console.say(f"The launcher failed: {problem}", sys.stderr)
@@ -266,6 +269,9 @@ class Job:
                 row["state"] = DONE
                 if result:
                     row |= scores.outcome(result, self.metric)
+                    if result.is_dir() and row["score"] is None:
+                        text = f"job {number}: it has no {self.metric}, and so no score"
+                        console.warn(f"{text}; {self.cure(result)}")
         except signals.Interrupted as stop:
             row["state"] = f"interrupted: {stop.args[1]}"
             if stop.args[0] in signals.ANNOUNCING and "SUBMITIT_EXECUTOR" in os.environ:
@@ -281,9 +287,16 @@ class Job:
         finally:
             row["seconds"] = round(time.monotonic() - began, 1)
             self.record(row)
-        if result and result.is_dir() and row["score"] is None:
-            console.warn(f"job {number}: it has no {self.metric}, and so no score; train longer")
         return row
+
+    def cure(self, folder: Path) -> str:
+        """Returns what gives a run the score that it lacks."""
+        kind = self.metric.partition("/")[0]
+        with contextlib.suppress(UserError):  # it has no metrics at all
+            names = [name for name in runs.read(folder).names() if name.startswith(f"{kind}/")]
+            if f"{kind}/return" in names and self.metric not in names:
+                return closest(self.metric, names)
+        return "train longer"
 
     def own_settings(self, cfg: settings.Train, folder: str, is_again: bool) -> settings.Train:
         """Returns the settings of a training with what differs for a job of a sweep."""

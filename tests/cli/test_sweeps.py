@@ -142,6 +142,15 @@ def test_sweep_without_a_score_ends_with_the_reason(here, capsys, sweeper):
     assert "No job has a score, so none is the best, as no episode finished" in err
 
 
+def test_misspelt_metric_is_named_once_a_job_has_ended(here, capsys):
+    for metric, name in (("episode/retrun", "episode/return"), ("eval/lenght", "eval/length")):
+        words = [f"metric={metric}", "finish.evaluate=true", "finish.episodes=4"]
+        assert train.main([*SHORT, "-m", "seed=1", *words]) == 0
+        err = capsys.readouterr().err
+        assert f"job 0: it has no {metric}, and so no score; did you mean {name}?" in err
+        assert f"none has {metric}; did you mean {name}?" in err
+
+
 def test_table_stands_while_jobs_run(here, monkeypatch):
     """Even if a job of the basic launcher ends this process, with `os._exit` or worse."""
     states = []
