@@ -270,6 +270,8 @@ def sentence(error: Mapping) -> str:
     if kind == "literal_error":
         words = re.findall("'([^']*)'", facts["expected"])
         return f"{value!r} is unknown; {closest(value, words)}"
+    if kind == "tuple_type" and isinstance(value, list):
+        return f"expected a tuple, got the list {got}"
     if wanted := WANTED.get(kind.split("_")[0]):
         return f"expected {wanted}, got {got}"
     if kind.startswith("dataclass"):

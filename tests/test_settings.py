@@ -151,6 +151,8 @@ def test_checked():
         f(4, c=2)
     with pytest.raises(ValueError, match="^a: expected an integer, got 1.5$"):
         f(1.5)
+    with pytest.raises(ValueError, match=r"^sizes: expected a tuple, got the list \[1\]$"):
+        checked(lambda sizes=(): sizes)([1])
     with pytest.raises(TypeError):
         f(1, typo=1)
 
