@@ -36,7 +36,7 @@ from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, signals
 from megastep.agents.launch.again import AUTO
 from megastep.agents.reports import runs
-from megastep.agents.runs import folders, scores
+from megastep.agents.runs import folders, populations, scores
 from megastep.agents.types import Row
 from megastep.atomic_files import write_atomically
 from megastep.settings import closest
@@ -137,7 +137,9 @@ def sweep(composer: Composer, words: list[str]) -> int:
         "hydra.job.config.override_dirname.exclude_keys": json.dumps(once),
     }
     words = [f"{key}={value}" for key, value in options.items() if key not in overrides]
-    words += [str(override.input_line) for override in overrides.values()]
+    for text in (str(override.input_line) for override in overrides.values()):
+        # Hydra itself would refuse new keys in {}, such as population.vary's
+        words.append(f"++{text}" if re.match(r"[^+~=]+=\{", text) else text)
     if (package.ROOT / "train.py").exists():  # processes of launchers find a checkout, too
         paths = str(package.ROOT), os.environ.get("PYTHONPATH")
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
@@ -267,6 +269,8 @@ class Job:
                 with gpu_slots.taken(cfg, number) as cfg:
                     result = composer.command.run(cfg)
                 row["state"] = DONE
+                if result and (best := populations.best(result)) is not None:
+                    result = populations.folder_of(result, best)
                 if result:
                     row |= scores.outcome(result, self.metric)
                     if result.is_dir() and row["score"] is None:

@@ -102,6 +102,13 @@ def test_sweep_folders_and_table(here, capsys):
     assert folders.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
 
 
+def test_a_population_has_the_score_of_its_best_member(here):
+    words = [*SMALL, f"samples={4 * UPDATE}", "population.size=2", f"population.every={2 * UPDATE}"]
+    words += ["population.vary={learner.lr: {choices: [1e-3]}}", "logger=none"]
+    assert train.main([*words, "-m", "env.pay=0.5,3", "hydra.sweep.dir=mine"]) == 0
+    assert [row["score"] for row in rows("mine")] == ["2.0", "12.0"]
+
+
 def test_failed_jobs(here, capsys):
     words = [*SHORT, "-m", "env.mood=cross,fine,cross", "hydra.sweep.dir=mine"]
     assert train.main(words) == 1
